@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from holdfast._core import Memory, OutOfRange, Rule, ServerTls, __version__
     from holdfast.client import Client, SyncClient
     from holdfast.config.tag_files.read import load_tags
+    from holdfast.config.text.problems import ConfigError
     from holdfast.errors import (
         ConnectFailed,
         ConnectionLost,
@@ -46,6 +47,7 @@ else:
             **dict.fromkeys(("Client", "SyncClient"), "holdfast.client"),
             **dict.fromkeys(_ERRORS, "holdfast.errors"),
             **dict.fromkeys(("Tag", "TagError", "TagList"), "holdfast.tags"),
+            "ConfigError": "holdfast.config.text.problems",
             "Poller": "holdfast.polling",
             "Server": "holdfast.server",
             "WriteCallback": "holdfast.server.write_callback",
@@ -57,6 +59,7 @@ else:
 
 __all__ = [
     "Client",
+    "ConfigError",
     "ConnectFailed",
     "ConnectionLost",
     "InvalidResponse",

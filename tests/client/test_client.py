@@ -30,6 +30,7 @@ from holdfast.cli.device_errors import maybe_written
 from holdfast.client import endpoint as endpoints
 from holdfast.client.requests import TooManyValues
 from holdfast.client.url import NetworkTarget, SerialTarget, Tls, Tolerance, parse
+from holdfast.config.text.problems import Problem
 from holdfast.net import event_loop
 from holdfast.polling import WriteFailed
 from holdfast.server import Identity
@@ -830,6 +831,10 @@ def test_no_error_of_a_later_request_says_that_nothing_was_written(
         WriteFailed("meter", "power", 3),
         TooManyValues(200, 123),
         Refused("power", "power: too large"),
+        holdfast.TagError("scale", "scale is 0"),
+        holdfast.ConfigError(
+            "b.yaml", [Problem(file, 1, 2, "a", "bad") for file in ("a", "b.yaml")]
+        ),
     ],
     ids=lambda error: type(error).__name__,
 )

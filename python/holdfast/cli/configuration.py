@@ -40,7 +40,7 @@ def load_whole(path: Path | str) -> Config:
     try:
         return answered(lambda: _load_whole(path))
     except NotAnswered as error:
-        raise ConfigNotAnswered(error) from None
+        raise ConfigNotAnswered.of(error) from None
 
 
 def _load_whole(path: Path | str) -> Config:

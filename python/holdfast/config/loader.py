@@ -60,7 +60,7 @@ def loaded(path: Path | str) -> tuple[Config, yaml_document.Document]:
     try:
         return bounded_files.answered(work)
     except bounded_files.NotAnswered as error:
-        raise ConfigNotAnswered(error) from None
+        raise ConfigNotAnswered.of(error) from None
 
 
 def checked(document: yaml_document.Document, problems: list[Problem], folder: Path) -> Config:

@@ -21,8 +21,12 @@ class TagError(ValueError):
     """A tag that can't be: `key` is the wrong part, such as `scale`."""
 
     def __init__(self, key: str, message: str) -> None:
-        super().__init__(message)
+        super().__init__(key, message)  # Its arguments, so that it can be pickled.
         self.key = key
+        self._message = message
+
+    def __str__(self) -> str:
+        return self._message
 
 
 class Scaled(NamedTuple):

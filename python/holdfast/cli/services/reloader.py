@@ -210,7 +210,7 @@ class Reloader:
         except NotAnswered as error:
             # The look that led here is not to lead here again.
             self._loaded_files = self._last_snapshot or self._loaded_files
-            problems = [str(ConfigNotAnswered(error))]
+            problems = [str(ConfigNotAnswered.of(error))]
         except click.UsageError as error:
             problems = [error.format_message()]
         except ReloadRefused as refused:

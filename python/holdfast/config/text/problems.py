@@ -40,12 +40,17 @@ class ConfigError(Exception):
             return (other, problem.file, problem.line or 0, problem.column or 0)
 
         self.problems: tuple[Problem, ...] = tuple(sorted(problems, key=order))
-        super().__init__("\n".join(str(problem) for problem in self.problems))
+        super().__init__(file, self.problems)  # Its arguments, so that it can be pickled.
+
+    def __str__(self) -> str:
+        return "\n".join(str(problem) for problem in self.problems)
 
 
 class ConfigNotAnswered(ConfigError):
     """A file was not read in time. The configuration may be valid."""
 
-    def __init__(self, error: NotAnswered) -> None:
+    @classmethod
+    def of(cls, error: NotAnswered) -> ConfigNotAnswered:
+        """That of an error of the system."""
         file = str(error.filename)
-        super().__init__(file, [Problem(file, None, None, "", f"can't be read: {error.strerror}")])
+        return cls(file, [Problem(file, None, None, "", f"can't be read: {error.strerror}")])

@@ -175,7 +175,7 @@ def read_bytes(path: Path, file: str, max_bytes: int = MAX_BYTES) -> bytes:
     try:
         return bounded_files.read(path, max_bytes, named_pipe=True)
     except bounded_files.NotAnswered as error:
-        raise ConfigNotAnswered(error) from None
+        raise ConfigNotAnswered.of(error) from None
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
         raise _error(file, f"can't be read: {reason}") from None
