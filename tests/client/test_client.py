@@ -1149,8 +1149,9 @@ def test_calls_that_wait_are_told_that_the_client_was_closed() -> None:
             await plc.close()
 
             for task in tasks:
-                with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                with pytest.raises(holdfast.ConnectionLost, match="closed by this side") as error:
                     await task
+                assert error.value.maybe_sent == (task in tasks[:2])
             assert device.connections == 1
             assert await plc.read_holding_registers(7, 1) == [7]
             assert device.connections == 2
@@ -1170,8 +1171,9 @@ def test_calls_that_wait_for_a_connection_are_told_that_the_client_was_closed() 
             await plc.close()
 
             for task in tasks:
-                with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                with pytest.raises(holdfast.ConnectionLost, match="closed by this side") as error:
                     await task
+                assert not error.value.maybe_sent
             assert device.requests == []
 
     run(main)
@@ -1187,8 +1189,9 @@ def test_calls_that_wait_for_a_thread_are_told_that_the_client_was_closed() -> N
             await asyncio.wait_for(plc.close(), wire.DEADLINE)
 
             for task in tasks:
-                with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                with pytest.raises(holdfast.ConnectionLost, match="closed by this side") as error:
                     await task
+                assert error.value.maybe_sent == (task is tasks[0])
             assert len(device.requests) == 1
             assert await plc.read_holding_registers(7, 1) == [7]
             await plc.close()
@@ -1210,8 +1213,9 @@ def test_a_call_whose_turn_comes_at_a_close_is_not_sent_after_it() -> None:
             await asyncio.to_thread(device.await_requests, 1)
             device.requests[0].answer()
             await tasks[0]
-            with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+            with pytest.raises(holdfast.ConnectionLost, match="closed by this side") as error:
                 await tasks[1]
+            assert not error.value.maybe_sent
             assert (len(device.requests), device.connections) == (1, 1)
 
     run(main)

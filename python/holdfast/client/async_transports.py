@@ -80,7 +80,7 @@ class ThreadedConnection:
         def carry() -> Any:
             # The client was closed, and possibly used again, while this call waited for its turn.
             if executor is not self._executor:
-                raise ConnectionLost(CLOSED)
+                raise _closed_before_sent()
             return self._core.call(request, unit, timeout, cancelled.is_set)
 
         try:
@@ -142,7 +142,7 @@ class AsyncConnection:
             await here.turn()
         try:
             if here.closes != closes:
-                raise ConnectionLost(CLOSED)
+                raise _closed_before_sent()
             now, left, attempt = here.time(), timeout, None
             deadline = now + timeout
             while True:
@@ -269,7 +269,7 @@ class _LoopConnection:
         self.closes += 1
         for turn in self.queue:
             if not turn.done():
-                turn.set_exception(ConnectionLost(CLOSED))
+                turn.set_exception(_closed_before_sent())
         self.queue.clear()
         if self._connecting is not None:
             self._connecting.cancel()
@@ -337,7 +337,7 @@ class _LoopConnection:
         if not done:
             raise self._not_in_time(timeout)
         if connecting.cancelled():
-            raise ConnectionLost(CLOSED)
+            raise _closed_before_sent()
         failure = connecting.exception()
         if isinstance(failure, ModbusError):
             raise copy.copy(failure) from failure.__cause__
@@ -495,6 +495,13 @@ class _Streamed(_Protocol, asyncio.Protocol):
     def __init__(self, here: _LoopConnection, core: Connection) -> None:
         super().__init__(here, core)
         self.data_received = core.data_received  # type: ignore[assignment, method-assign]
+
+
+def _closed_before_sent() -> ConnectionLost:
+    """The error of a call that `close` has ended before its request was sent."""
+    error = ConnectionLost(CLOSED)
+    error.maybe_sent = False
+    return error
 
 
 def explained(error: Exception) -> str:
