@@ -5,7 +5,7 @@ from __future__ import annotations
 from asyncio import AbstractEventLoop, Future
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from os import PathLike
-from typing import Any, Final, Literal, Self, final
+from typing import Any, Final, Literal, Self, SupportsIndex, final
 
 from holdfast.errors import ModbusError
 from holdfast.server.options import (
@@ -242,7 +242,7 @@ class Memory:
     def read_many(self, ranges: Sequence[tuple[str, int, int]]) -> list[list[int]]:
         """Reads several ranges (area, address, count) as one snapshot. Raises like `read`."""
 
-    def write(self, area: str, address: int, values: Iterable[int]) -> None:
+    def write(self, area: str, address: int, values: Iterable[SupportsIndex]) -> None:
         """Writes bits (0, 1, False, True) or registers (integers 0 to 65535) in one step.
 
         Raises `OutOfRange` outside the area, `ValueError` for no values, a value out of range, an
@@ -252,7 +252,7 @@ class Memory:
         did not confirm in time.
         """
 
-    def write_many(self, writes: Sequence[tuple[str, int, Iterable[int]]]) -> None:
+    def write_many(self, writes: Sequence[tuple[str, int, Iterable[SupportsIndex]]]) -> None:
         """Writes to several ranges (area, address, values) in one step.
 
         Where two overlap, the later one wins. Raises the errors of `write`; an error in one write
@@ -869,19 +869,19 @@ class Request:
         """Functions 1 to 4, depending on the area."""
 
     @staticmethod
-    def write_coil(address: int, value: bool) -> Request:
+    def write_coil(address: int, value: SupportsIndex) -> Request:
         """Function 5."""
 
     @staticmethod
-    def write_register(address: int, value: int) -> Request:
+    def write_register(address: int, value: SupportsIndex) -> Request:
         """Function 6."""
 
     @staticmethod
-    def write_coils(address: int, values: Iterable[int]) -> Request:
+    def write_coils(address: int, values: Iterable[SupportsIndex]) -> Request:
         """Function 15."""
 
     @staticmethod
-    def write_registers(address: int, values: Iterable[int]) -> Request:
+    def write_registers(address: int, values: Iterable[SupportsIndex]) -> Request:
         """Function 16."""
 
     @staticmethod
@@ -890,7 +890,7 @@ class Request:
 
     @staticmethod
     def read_write(
-        read_address: int, count: int, write_address: int, values: Iterable[int]
+        read_address: int, count: int, write_address: int, values: Iterable[SupportsIndex]
     ) -> Request:
         """Function 23."""
 
@@ -911,7 +911,7 @@ class Request:
         """Function 20. Each range is a file, its first record and the number of records."""
 
     @staticmethod
-    def write_files(ranges: Sequence[tuple[int, int, Iterable[int]]]) -> Request:
+    def write_files(ranges: Sequence[tuple[int, int, Iterable[SupportsIndex]]]) -> Request:
         """Function 21. Each range is a file, its first record and the records."""
 
     @staticmethod

@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict, get_args
+from typing import (
+    TYPE_CHECKING,
+    Literal,
+    Protocol,
+    SupportsIndex,
+    TypeAlias,
+    TypedDict,
+    get_args,
+)
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from os import PathLike
 
 Access: TypeAlias = Literal["read-only", "read-write"]
@@ -19,6 +28,15 @@ REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
 SHORT_AREAS: dict[str, Area] = dict(zip(("co", "di", "hr", "ir"), AREAS, strict=True))
 """The areas by their short names."""
 SHORT_OF: dict[Area, str] = {area: short for short, area in SHORT_AREAS.items()}
+
+
+class Integers(Protocol):
+    """Integers or bits in a sequence: a list, a tuple, a range or an array of NumPy."""
+
+    def __len__(self) -> int: ...
+    def __iter__(self) -> Iterator[SupportsIndex]: ...
+    def __getitem__(self, part: slice, /) -> Integers: ...
+
 
 Ranges: TypeAlias = "list[tuple[Area, int, int]]"
 """Areas, first addresses and counts."""

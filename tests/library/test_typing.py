@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
-from typing import TYPE_CHECKING, Any, assert_type, get_args
+from typing import TYPE_CHECKING, Any, SupportsIndex, assert_type, get_args
 
 import pytest
 
@@ -19,6 +19,8 @@ from support.paths import ROOT
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from holdfast.types import Integers
+
 
 def of_the_blocking_client(plc: holdfast.SyncClient, kind: str) -> None:
     assert_type(plc.read("holding_registers", 0, "float32", "CDAB"), float)
@@ -28,6 +30,24 @@ def of_the_blocking_client(plc: holdfast.SyncClient, kind: str) -> None:
     assert_type(plc.read("holding_registers", 0, "string:20", encoding="utf-8"), Any)
     assert_type(plc.read("holding_registers", 0, kind), Any)
     assert_type(plc.read_coils(0, 8), list[bool])
+
+
+def of_values_as_numpy_has_them(
+    plc: holdfast.SyncClient, one: SupportsIndex, many: Integers
+) -> None:
+    plc.write_register(0, one)
+    plc.write_registers(0, many)
+    plc.write_registers(0, [one])
+    plc.write_coil(0, 1)
+    plc.write_coils(0, many)
+    plc.write_file_records([(4, 0, many)])
+    assert_type(plc.read_write(0, 1, 0, many), list[int])
+    assert_type(values.decode(many, "float32"), float)
+
+
+def of_memories(memory: holdfast.Memory, one: SupportsIndex, many: Integers) -> None:
+    memory.write("holding_registers", 0, many)
+    memory.write_many([("coils", 0, [one])])
 
 
 async def of_the_asynchronous_client(plc: holdfast.Client) -> None:

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
 from holdfast._core import Request
 from holdfast.client import requests
@@ -16,7 +16,15 @@ if TYPE_CHECKING:
 
     from holdfast.client.async_transports import AsyncTransport
     from holdfast.client.requests import EventLog, Identification, Plan, Result, ServerId
-    from holdfast.types import Area, BoolType, ByteOrder, FloatType, IntegerType, ValueType
+    from holdfast.types import (
+        Area,
+        BoolType,
+        ByteOrder,
+        FloatType,
+        Integers,
+        IntegerType,
+        ValueType,
+    )
 
 
 class AsyncOperations(BaseClient):
@@ -132,14 +140,16 @@ class AsyncOperations(BaseClient):
         steps = requests.write_typed(area, address, value, type, order, encoding, split=split)
         await self._run(steps, unit)
 
-    async def write_coil(self, address: int, value: bool, *, unit: int | None = None) -> None:
+    async def write_coil(
+        self, address: int, value: SupportsIndex, *, unit: int | None = None
+    ) -> None:
         """Writes one coil (function 5)."""
         await self._call(Request.write_coil(address, value), unit)
 
     async def write_coils(
         self,
         address: int,
-        values: Sequence[bool],
+        values: Integers,
         *,
         split: bool = False,
         unit: int | None = None,
@@ -149,14 +159,16 @@ class AsyncOperations(BaseClient):
         """
         await self._run(requests.write_range("coils", address, values, split=split), unit)
 
-    async def write_register(self, address: int, value: int, *, unit: int | None = None) -> None:
+    async def write_register(
+        self, address: int, value: SupportsIndex, *, unit: int | None = None
+    ) -> None:
         """Writes one holding register (function 6), 0 to 65535."""
         await self._call(Request.write_register(address, value), unit)
 
     async def write_registers(
         self,
         address: int,
-        values: Sequence[int],
+        values: Integers,
         *,
         split: bool = False,
         unit: int | None = None,
@@ -179,7 +191,7 @@ class AsyncOperations(BaseClient):
         read_address: int,
         count: int,
         write_address: int,
-        values: Sequence[int],
+        values: Integers,
         *,
         unit: int | None = None,
     ) -> list[int]:
@@ -233,13 +245,13 @@ class AsyncOperations(BaseClient):
         return await self._run(Request.read_files(ranges), unit)
 
     async def write_file_record(
-        self, file: int, record: int, values: Sequence[int], *, unit: int | None = None
+        self, file: int, record: int, values: Integers, *, unit: int | None = None
     ) -> None:
         """Writes up to 122 records of a file from `record` on (function 21)."""
         await self._call(Request.write_files([(file, record, values)]), unit)
 
     async def write_file_records(
-        self, ranges: Sequence[tuple[int, int, Sequence[int]]], *, unit: int | None = None
+        self, ranges: Sequence[tuple[int, int, Integers]], *, unit: int | None = None
     ) -> None:
         """Writes ranges of records in one request (function 21): each is a file, the first record
         and the values.

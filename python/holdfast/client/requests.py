@@ -32,7 +32,7 @@ from holdfast.values.integers import as_integer
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast.types import Area
+    from holdfast.types import Area, Integers
 
 Sent = TypeVar("Sent")
 Result = TypeVar("Result")
@@ -208,7 +208,7 @@ class TooManyValues(ValueError):
 
 
 def write_range(
-    area: Area, address: int, items: Sequence[int], element: int = 1, *, split: bool
+    area: Area, address: int, items: Integers, element: int = 1, *, split: bool
 ) -> Steps[None]:
     """Writes bits or registers in one request, or with `split` in several.
 

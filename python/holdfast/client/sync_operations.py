@@ -5,7 +5,7 @@ Made from `async_operations.py`: change that one, then run `make format`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
 from holdfast._core import Request
 from holdfast.client import requests
@@ -16,7 +16,15 @@ if TYPE_CHECKING:
 
     from holdfast._core import BlockingClient
     from holdfast.client.requests import EventLog, Identification, Plan, Result, ServerId
-    from holdfast.types import Area, BoolType, ByteOrder, FloatType, IntegerType, ValueType
+    from holdfast.types import (
+        Area,
+        BoolType,
+        ByteOrder,
+        FloatType,
+        Integers,
+        IntegerType,
+        ValueType,
+    )
 
 
 class SyncOperations(BaseClient):
@@ -132,14 +140,14 @@ class SyncOperations(BaseClient):
         steps = requests.write_typed(area, address, value, type, order, encoding, split=split)
         self._run(steps, unit)
 
-    def write_coil(self, address: int, value: bool, *, unit: int | None = None) -> None:
+    def write_coil(self, address: int, value: SupportsIndex, *, unit: int | None = None) -> None:
         """Writes one coil (function 5)."""
         self._call(Request.write_coil(address, value), unit)
 
     def write_coils(
         self,
         address: int,
-        values: Sequence[bool],
+        values: Integers,
         *,
         split: bool = False,
         unit: int | None = None,
@@ -149,14 +157,16 @@ class SyncOperations(BaseClient):
         """
         self._run(requests.write_range("coils", address, values, split=split), unit)
 
-    def write_register(self, address: int, value: int, *, unit: int | None = None) -> None:
+    def write_register(
+        self, address: int, value: SupportsIndex, *, unit: int | None = None
+    ) -> None:
         """Writes one holding register (function 6), 0 to 65535."""
         self._call(Request.write_register(address, value), unit)
 
     def write_registers(
         self,
         address: int,
-        values: Sequence[int],
+        values: Integers,
         *,
         split: bool = False,
         unit: int | None = None,
@@ -177,7 +187,7 @@ class SyncOperations(BaseClient):
         read_address: int,
         count: int,
         write_address: int,
-        values: Sequence[int],
+        values: Integers,
         *,
         unit: int | None = None,
     ) -> list[int]:
@@ -231,13 +241,13 @@ class SyncOperations(BaseClient):
         return self._run(Request.read_files(ranges), unit)
 
     def write_file_record(
-        self, file: int, record: int, values: Sequence[int], *, unit: int | None = None
+        self, file: int, record: int, values: Integers, *, unit: int | None = None
     ) -> None:
         """Writes up to 122 records of a file from `record` on (function 21)."""
         self._call(Request.write_files([(file, record, values)]), unit)
 
     def write_file_records(
-        self, ranges: Sequence[tuple[int, int, Sequence[int]]], *, unit: int | None = None
+        self, ranges: Sequence[tuple[int, int, Integers]], *, unit: int | None = None
     ) -> None:
         """Writes ranges of records in one request (function 21): each is a file, the first record
         and the values.

@@ -16,7 +16,9 @@ from holdfast.values.orders import swap_registers
 if TYPE_CHECKING:
     from typing_extensions import Buffer
 
-Registers: TypeAlias = "Sequence[int] | Buffer"
+    from holdfast.types import Integers
+
+Registers: TypeAlias = "Sequence[int] | Integers | Buffer"
 """Integers 0 to 65535, big-endian bytes, or a buffer of unsigned 16-bit integers, such as a numpy
 array of `uint16`. For `bool`, also bits: a sequence of 0, 1, `False`, `True`, or a `bool` array.
 """
