@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 from holdfast._core import Attempt, BlockingClient, Connection
 from holdfast.client.endpoint import endpoint
 from holdfast.client.fork import renew_in_children
+from holdfast.client.program_end import sleep_at_end
 from holdfast.client.tcp_connect import addresses, connected
 from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
 from holdfast.runtime.text import os_error_text
@@ -218,6 +219,7 @@ class AsyncConnection:
         late = (0, 0.0) if last is None else (last.late, last.longest_late)
         here = _LoopConnection(self._target, self._endpoint, self._max_in_flight, loop, *late)
         self._last = here
+        sleep_at_end(loop)
         return here
 
 

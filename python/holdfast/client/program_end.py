@@ -1,0 +1,49 @@
+"""Lets the event loops of daemon threads sleep when the program ends.
+
+Up to Python 3.13, the interpreter ends such a thread wherever it runs Python code. Where the native
+core has called that code, as for every reply, this would abort the process.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import sys
+import time
+from threading import Event
+from typing import TYPE_CHECKING
+from weakref import WeakSet
+
+if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
+
+SLEEP_S = 1.0
+"""Longer than the rest of the end takes. Not for ever: a later hook may wait for the loop."""
+
+_loops: WeakSet[AbstractEventLoop] = WeakSet()
+
+
+def sleep_at_end(loop: AbstractEventLoop) -> None:
+    """Lets a loop sleep if it still runs when the program ends."""
+    _loops.add(loop)
+
+
+def _sleep(sleeps: Event) -> None:
+    sleeps.set()
+    time.sleep(SLEEP_S)
+
+
+def _end() -> None:
+    for loop in list(_loops):
+        if loop.is_running():
+            sleeps = Event()
+            with contextlib.suppress(RuntimeError):  # It may be closed meanwhile.
+                loop.call_soon_threadsafe(_sleep, sleeps)
+                sleeps.wait(SLEEP_S)
+
+
+if sys.version_info < (3, 14):
+    atexit.register(_end)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_loops.clear)  # A child does not have the other threads.
