@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from holdfast.appliance import Appliance
+from holdfast.appliance.parts import tag_writes
+from holdfast.appliance.parts.tag_writes import TagWrites
 from holdfast.appliance.services.outputs import _Site
 from holdfast.outputs import sending
+from holdfast.outputs.mqtt import commands
 from holdfast.runtime.standstill import STANDSTILL_S
 from support import wire
 from support.mqtt_plant import TAGS, Client, Plant
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
 
@@ -195,6 +199,63 @@ def test_writes_are_in_the_audit_log(plant: Plant, tmp_path: Path) -> None:
     )
     assert (first["area"], first["address"], first["values"]) == ("holding_registers", 0, [215])
     assert first["peer"].endswith("plant/pump/temperature/set")
+
+
+def followed_by(event: threading.Event, call: Callable[..., None]) -> Callable[..., None]:
+    def called(*given: Any) -> None:
+        call(*given)
+        event.set()
+
+    return called
+
+
+class Held:
+    """A write that its device has not answered, and a plant that can be stopped."""
+
+    def __init__(self, plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.sent, self.stopping = threading.Event(), threading.Event()
+        for name, event in (("_send", self.sent), ("stop", self.stopping)):
+            monkeypatch.setattr(TagWrites, name, followed_by(event, getattr(TagWrites, name)))
+        self.plant, self.device, self.probe = plant, plant.slow_device(), plant.probe("plant/#")
+        plant.appliance = Appliance(plant.config({"writes": True}, audit={"file": "audit.log"}))
+        plant.appliance.start()
+        self.probe.until("plant/holdfast/status/pump", "online")
+        self.device.hold()
+        self.probe.publish("plant/pump/temperature/set", "21.5")
+        assert self.sent.wait(wire.DEADLINE)
+
+    def outcomes(self) -> list[str]:
+        """Those of the audit log."""
+        with (self.plant.folder / "audit.log").open() as file:
+            lines = [json.loads(line) for line in file]
+        return [line["outcome"] for line in lines if line.get("function") == "write"]
+
+
+def test_the_stop_waits_for_a_write_and_refuses_others(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tag_writes, "STOP_TIMEOUT_S", wire.DEADLINE)
+    monkeypatch.setattr(commands, "END_TIMEOUT_S", wire.DEADLINE)
+    held = Held(plant, monkeypatch)
+    with ThreadPoolExecutor(1) as threads:
+        stopped = threads.submit(plant.stop)
+        assert held.stopping.wait(wire.DEADLINE)
+        held.probe.publish("plant/pump/valve/set", "true")
+        assert reply(held.probe, "valve")["reason"] == "stopping"
+        held.device.go_on()
+        assert reply(held.probe, "temperature")["status"] == "accepted"
+        stopped.result()
+    assert held.outcomes() == ["stopping", "done"]
+
+
+def test_a_write_without_an_answer_at_the_stop_is_reported(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tag_writes, "STOP_TIMEOUT_S", 0.05)
+    held = Held(plant, monkeypatch)
+    plant.stop()
+    assert reply(held.probe, "temperature")["reason"] == "unanswered"
+    assert held.outcomes() == ["unanswered"]
 
 
 def test_a_reload_brings_new_set_topics(plant: Plant) -> None:

@@ -84,7 +84,7 @@ class Plant:
         self._running.callback(self.broker.kill)
         self.url = self.broker.url
         self.interval = 0.05
-        self.devices: dict[str, Device] = {}
+        self.devices: dict[str, Device | Proxy] = {}
         self.appliance: Appliance | None = None
 
     def __enter__(self) -> Self:
@@ -101,8 +101,15 @@ class Plant:
         self._running.close()
 
     def device(self, name: str = "pump", registers: int = 100) -> Device:
-        made = self.devices[name] = Device(registers)
+        self.devices[name] = made = Device(registers)
         self._running.callback(made.stop)
+        return made
+
+    def slow_device(self, name: str = "pump") -> Proxy:
+        """The way to a device, which can hold back requests and replies."""
+        port = int(self.device(name).url.rpartition(":")[2])
+        made = self.devices[name] = Proxy(port, "tcp")
+        self._running.callback(made.close)
         return made
 
     def proxy(self) -> Proxy:

@@ -119,8 +119,15 @@ class Devices(Part):
 
         return adopt
 
+    def stop(self) -> None:
+        """Refuses writes of outputs from now on."""
+        if self.writes is not None:
+            self.writes.stop()
+
     def close(self) -> None:
         """Stops the poller, and with it the threads that take its results."""
+        if self.writes is not None:
+            self.writes.finish()
         if self.poller is not None:
             self.poller.stop()
         for thread in (self.values, self.writes):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+import time
+from math import inf
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast.client.requests import write_typed
@@ -24,8 +26,11 @@ if TYPE_CHECKING:
 MAX_WAITING = 1000
 """The most writes that wait for their devices."""
 
-_WAIT_S = 1.0
-"""How long one wait for outcomes takes."""
+STOP_TIMEOUT_S = 2.0
+"""Time after the stop in which devices may still answer."""
+
+_WAIT_S, _STOP_WAIT_S = 1.0, 0.1
+"""How long one wait for outcomes takes, before and after the stop."""
 
 
 class _Write(NamedTuple):
@@ -36,15 +41,19 @@ class _Write(NamedTuple):
 
 
 class TagWrites:
-    """Sends writes, and reports their outcomes in a thread of its own. Ends with the poller."""
+    """Sends writes, and reports their outcomes in a thread of its own. Ends with the poller.
+
+    After a stop, it reports what devices have not answered in time: no write is without an outcome.
+    """
 
     def __init__(
         self, poller: Poller, audit: Audit | None, find: Callable[[str, str], Tag | None]
     ) -> None:
         self._poller, self._audit, self._find = poller, audit, find
         self._results = poller.receiver()
-        self._lock = threading.Lock()
+        self._changed = threading.Condition()
         self._pending: dict[int, _Write] = {}
+        self._gives_up_at = inf
         self._thread = threading.Thread(target=self._run, name="holdfast-writes", daemon=True)
 
     def write(
@@ -76,6 +85,17 @@ class TagWrites:
                 self._audit.write(**record, outcome=refused.reason)
             raise
 
+    def stop(self) -> None:
+        """Refuses further writes, and reports those before within `STOP_TIMEOUT_S`."""
+        with self._changed:
+            self._gives_up_at = time.monotonic() + STOP_TIMEOUT_S
+        self._results.wake()
+
+    def finish(self) -> None:
+        """Waits for the devices, at most until those that have not answered are reported."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._pending, STOP_TIMEOUT_S)
+
     def join(self, timeout: float) -> None:
         """Waits for the thread, which ends with the poller."""
         if self._thread.ident is not None:
@@ -88,7 +108,9 @@ class TagWrites:
             except Unrecorded:
                 detail = "the audit log can't be written, and no write is carried out without it"
                 raise NotWritten("unrecorded", detail) from None
-        with self._lock:
+        with self._changed:
+            if self._gives_up_at < inf:
+                raise NotWritten("stopping", "Holdfast is stopping; nothing was sent")
             if len(self._pending) >= MAX_WAITING:
                 raise NotWritten("busy", f"{MAX_WAITING} writes wait for their devices")
             try:
@@ -100,21 +122,35 @@ class TagWrites:
                 self._thread.start()
 
     def _run(self) -> None:
-        while (taken := self._results.take(_WAIT_S)) is not None:
+        wait = _WAIT_S
+        while (taken := self._results.take(wait)) is not None:
             for number, fault in taken[1]:
-                with self._lock:
-                    write = self._pending.pop(number, None)
-                if write is not None:
-                    try:
-                        self._report(write, fault)
-                    except Exception:  # A fault in one outcome must not end all others.
-                        log_lines.problem("tag_write_failed")
+                refused = NotWritten(fault_word(fault), fault_text(fault)) if fault else None
+                self._report(number, refused)
+            wait = _WAIT_S if self._gives_up_at == inf else _STOP_WAIT_S
+            if time.monotonic() >= self._gives_up_at:
+                self._give_up()
+        self._give_up()
 
-    def _report(self, write: _Write, fault: int) -> None:
-        outcome = fault_word(fault) if fault else "done"
-        if self._audit is not None:
-            self._audit.write_all([{**write.record, "outcome": outcome}], done=not fault)
-        write.done(NotWritten(outcome, fault_text(fault)) if fault else None)
+    def _give_up(self) -> None:
+        """Reports the writes whose outcome nobody will know."""
+        for number in list(self._pending):
+            detail = "no reply before the stop; the device may have carried out the write"
+            self._report(number, NotWritten("unanswered", detail))
+
+    def _report(self, number: int, refused: NotWritten | None) -> None:
+        with self._changed:
+            write = self._pending.pop(number, None)
+            self._changed.notify_all()
+        if write is None:
+            return
+        outcome = "done" if refused is None else refused.reason
+        try:
+            if self._audit is not None:
+                self._audit.write_all([{**write.record, "outcome": outcome}], done=refused is None)
+            write.done(refused)
+        except Exception:  # A fault in one outcome must not end all others.
+            log_lines.problem("tag_write_failed")
 
 
 def _request(tag: Tag | None, text: str, *, states: bool) -> tuple[Request, list[int]]:

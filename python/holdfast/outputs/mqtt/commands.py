@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 MAX_REPLIES = 1000
 """The most replies that the broker has not confirmed; more are dropped and counted."""
 
+END_TIMEOUT_S = 2.5
+"""How long an output waits for its last outcomes. After a stop, all are known before."""
+
 
 class Commands(CommandOutcomes):
     """The set topics of writable tags. A stale command must never be carried out: retained
@@ -38,6 +42,9 @@ class Commands(CommandOutcomes):
         self._tags: dict[str, tuple[str, str]] = {}
         self._replies: list[Delivery] = []
         self.replies_dropped = 0
+        self._waiting = 0
+        """Writes whose outcome is not known yet."""
+        self._changed = threading.Condition(self._lock)
 
     def counts(self) -> dict[str, int]:
         """The outcomes of commands, and the replies that could not be sent."""
@@ -69,8 +76,15 @@ class Commands(CommandOutcomes):
             self._write(message, session, *found)
         return True
 
+    def end(self) -> None:
+        """Waits for the outcomes of all commands, so that their replies are published."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._waiting, END_TIMEOUT_S)
+
     def _write(self, message: Publish, session: Session, device: str, tag: str) -> None:
         done = partial(self._done, message, session, device, tag)
+        with self._changed:
+            self._waiting += 1
         try:
             try:
                 text = bytes(message.payload).decode()
@@ -97,7 +111,9 @@ class Commands(CommandOutcomes):
         if refused is not None:
             reply |= {"status": "rejected", "reason": refused.reason, "detail": refused.detail}
         answer = self._answer(message, msgspec.json.encode(reply))
-        with self._lock:
+        with self._changed:
+            self._waiting -= 1
+            self._changed.notify_all()
             self._replies = [each for each in self._replies if not each.is_done]
             if answer is None or len(self._replies) >= MAX_REPLIES or session.error is not None:
                 self.replies_dropped += 1

@@ -71,7 +71,9 @@ class MqttOutput(BrokerReceiver):
         return True
 
     def close(self) -> None:
-        """Publishes that this output is offline, and ends the connection."""
+        """Publishes the last replies and that this output is offline, and ends the connection."""
+        if self._session is not None and self._session.error is None:
+            self._commands.end()
         self._disconnect(self._availability.of_output(OFFLINE))
 
     def status(self) -> dict[str, object]:
