@@ -240,7 +240,9 @@ def of_values(count: int) -> float:
     buffer, before = Buffer(), common.memory(os.getpid())["own"]
     for at in range(count // 100):
         now = time.time()
-        buffer.offer(Reading(f"device {at % 100}", TAG, 0.1 * number, now) for number in range(100))
+        buffer.offer(
+            [[Reading(f"device {at % 100}", TAG, 0.1 * number, now) for number in range(100)]]
+        )
     return (common.memory(os.getpid())["own"] - before) / len(buffer)
 
 

@@ -177,7 +177,7 @@ def holdfast(port: int, count: int, payload: str) -> str:
     thread.start()
     began, cpu = time.perf_counter(), time.process_time()
     for at in range(0, count, 1000):
-        buffer.offer(changes[at : at + 1000])
+        buffer.offer([changes[at : at + 1000]])
     until(lambda: not len(buffer))
     took = time.perf_counter() - began
     used = time.process_time() - cpu

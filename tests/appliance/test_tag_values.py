@@ -164,7 +164,7 @@ def test_a_receiver_that_can_not_be_reached_delays_nothing_else(
         assert (status["connected"], status["readings"]["sent"]) == (False, 0)
     stored = Stored(tmp_path / "down.db", 2**30, lambda _, name: tag(name))
     kept = []
-    while found := stored.first():
+    while found := stored.first(1):
         kept += [each.value for each in found if each.name == "power"]
         stored.remove_first()
     stored.close()

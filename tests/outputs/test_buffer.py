@@ -11,13 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast.outputs import Buffer
-from holdfast.outputs.buffer_file import MAX_ROW, Stored
+from holdfast.outputs.buffer import MAX_ROW
+from holdfast.outputs.buffer_file import Stored
 from support import wire
 from support.cases import examples
-from support.readings import numbered, numbers, reading, tag
+from support.readings import numbered, numbers, polls, reading, tag
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from holdfast.polling import Reading
@@ -60,7 +61,7 @@ def drained(buffer: Buffer, most: int = 3) -> list[int]:
 
 def test_what_is_taken_stays_until_it_is_done() -> None:
     buffer = Buffer()
-    buffer.offer(numbered(5))
+    buffer.offer(polls(5))
     assert numbers(buffer.take(3, 0)) == numbers(buffer.take(3, 0)) == [0, 1, 2]
     assert len(buffer) == 5
     buffer.done()
@@ -75,29 +76,29 @@ def test_a_wait_can_be_ended() -> None:
         buffer.wake()
         assert taken.result() == []
     assert time.monotonic() - began < wire.DEADLINE
-    buffer.offer(numbered(1))
+    buffer.offer(polls(1))
     assert numbers(buffer.take(1, 0)) == [0]
 
 
 def test_the_newest_stay_and_the_others_are_counted() -> None:
     buffer = Buffer(4)
-    buffer.offer(numbered(3))
-    buffer.offer(numbered(3, 3))
+    buffer.offer(polls(3))
+    buffer.offer(polls(3, 3))
     assert (buffer.dropped, drained(buffer)) == (2, [2, 3, 4, 5])
 
 
 def test_a_file_comes_before_memory_and_survives(opened: Opened, tmp_path: Path) -> None:
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
-    buffer.offer(numbered(5))
+    buffer.offer(polls(5))
     assert numbers(buffer.take(2, 0)) == [0, 1]
     buffer.keep(60, 2)
-    buffer.offer(numbered(2, 5))
+    buffer.offer(polls(2, 5))
     assert len(buffer) == 7
     buffer.detach()
     again = Buffer()
     again.stored = opened(tmp_path / "b.db")
-    again.offer(numbered(2, 7))
+    again.offer(polls(2, 7))
     assert len(again) == 7
     assert drained(again) == [0, 1, 2, 3, 4, 7, 8]
     assert drained(buffer) == [5, 6]
@@ -110,12 +111,12 @@ def test_readings_that_come_while_others_are_stored_do_not_hold_up_the_output(
     stored = buffer.stored = opened(tmp_path / "b.db")
     add = stored.add
 
-    def slow_disk(readings: list[Reading]) -> int:
-        buffer.offer(numbered(2, 100))
-        return add(readings)
+    def slow_disk(rows: Sequence[Sequence[Reading]]) -> int:
+        buffer.offer(polls(2, 100))
+        return add(rows)
 
     monkeypatch.setattr(stored, "add", slow_disk)
-    buffer.offer(numbered(5))
+    buffer.offer(polls(5))
     buffer.keep(60, 2)
     assert (stored.count, len(buffer)) == (5, 11)
 
@@ -123,7 +124,7 @@ def test_readings_that_come_while_others_are_stored_do_not_hold_up_the_output(
 def test_storing_ends_in_time_and_loses_nothing(opened: Opened, tmp_path: Path) -> None:
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
-    buffer.offer(numbered(5))
+    buffer.offer(polls(5))
     buffer.keep(0, 2)
     assert (buffer.stored.count, drained(buffer)) == (0, list(range(5)))
 
@@ -133,10 +134,50 @@ def test_a_large_step_is_stored_whole_and_sent_in_small_ones(
 ) -> None:
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
-    buffer.offer(numbered(2 * MAX_ROW + 1))
+    buffer.offer(polls(2 * MAX_ROW + 1))
     buffer.keep(60)
     assert numbers(buffer.take(9, 0)) == list(range(MAX_ROW))
     assert drained(buffer) == list(range(2 * MAX_ROW + 1))
+
+
+@pytest.mark.parametrize("with_file", [False, True])
+def test_what_is_taken_ends_with_a_whole_poll(
+    opened: Opened, tmp_path: Path, with_file: bool
+) -> None:
+    buffer = Buffer()
+    buffer.offer([numbered(3), numbered(3, 3), numbered(1, 6)])
+    if with_file:
+        buffer.stored = opened(tmp_path / "b.db")
+        buffer.keep(60, 2)
+    taken = []
+    while readings := buffer.take(4, 0):
+        taken.append(numbers(readings))
+        buffer.done()
+    assert taken[0] == list(range(3 if with_file else 6))
+    assert [number for numbers in taken for number in numbers] == list(range(7))
+    assert all(numbers[-1] in (2, 5, 6) for numbers in taken)
+
+
+def test_small_rows_of_a_file_are_sent_together(opened: Opened, tmp_path: Path) -> None:
+    buffer = Buffer()
+    buffer.stored = opened(tmp_path / "b.db")
+    for number in range(5):
+        buffer.offer(polls(1, number))
+        buffer.keep(60)
+    assert numbers(buffer.take(3, 0)) == [0, 1, 2]
+    buffer.done()
+    assert (numbers(buffer.take(3, 0)), buffer.stored.count) == ([3, 4], 2)
+
+
+def test_what_waits_longer_than_others_is_late() -> None:
+    buffer = Buffer(4)
+    buffer.offer(polls(3))
+    assert buffer.is_filling
+    assert [buffer.has_late(), buffer.has_late()] == [False, True]
+    buffer.take(3, 0)
+    buffer.offer(polls(2, 3))
+    assert not buffer.is_filling
+    assert [buffer.has_late(), buffer.has_late()] == [False, True]
 
 
 def test_what_was_taken_from_the_file_is_taken_again_after_a_crash(
@@ -144,7 +185,7 @@ def test_what_was_taken_from_the_file_is_taken_again_after_a_crash(
 ) -> None:
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
-    buffer.offer(numbered(3))
+    buffer.offer(polls(3))
     buffer.keep(60)
     assert numbers(buffer.take(9, 0)) == [0, 1, 2]
     buffer.detach()
@@ -157,9 +198,9 @@ def test_values_of_every_kind_survive_in_a_file(opened: Opened, tmp_path: Path) 
     values = [None, True, 0, -(2**63), 2**64 - 1, 0.1, "ä", b"\0\xff", [1, None, 2.5], ["a"]]
     stored = opened(tmp_path / "b.db")
     readings = [reading(value, fault=7, undecoded="why") for value in values]
-    assert stored.add(readings) == 0
+    assert stored.add([readings]) == 0
     stored.close()
-    assert opened(tmp_path / "b.db").first() == readings
+    assert opened(tmp_path / "b.db").first(1) == readings
 
 
 @pytest.mark.parametrize(
@@ -170,21 +211,21 @@ def test_a_tag_that_is_gone_is_replaced_by_one_of_its_kind(
     opened: Opened, tmp_path: Path, value: Any, kind: str
 ) -> None:
     stored = opened(tmp_path / "b.db", known=[])
-    stored.add([reading(value, tag=tag("gone"))])
-    [found] = stored.first()
+    stored.add([[reading(value, tag=tag("gone"))]])
+    [found] = stored.first(1)
     assert (found.name, found.tag.type, found.value) == ("gone", kind, value)
 
 
 def test_the_oldest_go_when_the_file_is_full(opened: Opened, tmp_path: Path) -> None:
     stored = opened(tmp_path / "b.db", max_bytes=1000)
-    dropped = sum(stored.add(numbered(10, start)) for start in range(0, 100, 10))
+    dropped = sum(stored.add([numbered(10, start)]) for start in range(0, 100, 10))
     left = 0
-    while stored.first():
-        left += len(stored.first())
+    while stored.first(1):
+        left += len(stored.first(1))
         stored.remove_first()
     assert (dropped + left, stored.count) == (100, 0)
     assert 0 < left < 100
-    assert stored.add(numbered(1000)) == 1000
+    assert stored.add([numbered(1000)]) == 1000
 
 
 def test_a_file_that_is_in_use_is_an_error(opened: Opened, tmp_path: Path) -> None:
@@ -206,16 +247,16 @@ def test_what_a_full_disk_refuses_stays_in_memory(
 ) -> None:
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
-    buffer.offer(numbered(3))
+    buffer.offer(polls(3))
 
-    def full(_: list[Reading]) -> int:
+    def full(_: Sequence[Sequence[Reading]]) -> int:
         raise OSError("database or disk is full")
 
     with monkeypatch.context() as patched:
         patched.setattr(buffer.stored, "add", full)
         with pytest.raises(OSError, match="disk is full"):
             buffer.keep(60)
-        assert numbers(buffer.take(2, 0)) == [0, 1]
+        assert numbers(buffer.take(2, 0)) == [0, 1, 2]
         with pytest.raises(OSError, match="disk is full"):
             buffer.keep(60)
     assert drained(buffer) == [0, 1, 2]
@@ -223,19 +264,19 @@ def test_what_a_full_disk_refuses_stays_in_memory(
 
 def test_a_full_disk_leaves_the_file_as_it_was(opened: Opened, tmp_path: Path) -> None:
     stored = opened(tmp_path / "b.db")
-    stored.add(numbered(3))
+    stored.add([numbered(3)])
     pages = stored._db.execute("PRAGMA page_count").fetchone()[0]
     stored._db.execute(f"PRAGMA max_page_count={pages}")
     with pytest.raises(OSError, match="disk is full"):
-        stored.add(numbered(1000))
-    assert (stored.count, numbers(stored.first())) == (3, [0, 1, 2])
+        stored.add([numbered(1000)])
+    assert (stored.count, numbers(stored.first(1))) == (3, [0, 1, 2])
     stored.remove_first()
     assert stored.count == 0
 
 
 def test_a_removal_that_fails_changes_nothing(opened: Opened, tmp_path: Path) -> None:
     stored = opened(tmp_path / "b.db")
-    stored.add(numbered(3))
+    stored.add([numbered(3)])
     # The commit fails, because a row refers to the one that is removed.
     stored._db.executescript(
         "PRAGMA foreign_keys=ON;"
@@ -243,22 +284,22 @@ def test_a_removal_that_fails_changes_nothing(opened: Opened, tmp_path: Path) ->
         "INSERT INTO other SELECT id FROM readings"
     )
     for _ in range(2):
-        assert numbers(stored.first()) == [0, 1, 2]
+        assert numbers(stored.first(1)) == [0, 1, 2]
         with pytest.raises(OSError, match="FOREIGN KEY constraint failed"):
             stored.remove_first()
         assert stored.count == 3
     stored._db.execute("DROP TABLE other")
     stored.remove_first()
-    assert (stored.first(), stored.count) == ([], 0)
+    assert (stored.first(1), stored.count) == ([], 0)
 
 
 def test_an_empty_file_is_small(opened: Opened, tmp_path: Path) -> None:
     file = tmp_path / "b.db"
     stored = opened(file)
     empty = file.stat().st_size
-    stored.add([reading("x" * 1_000_000)])
+    stored.add([[reading("x" * 1_000_000)]])
     assert file.stat().st_size > 1_000_000
-    stored.first()
+    stored.first(1)
     stored.remove_first()
     assert file.stat().st_size <= 2 * empty
 
@@ -270,10 +311,10 @@ def test_a_batch_that_the_file_has_dropped_takes_no_other_with_it(
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db", max_bytes=250)
     for start in range(0, 8, 4):
-        buffer.offer(numbered(4, start))
+        buffer.offer(polls(4, start))
         buffer.keep(60)
-    assert numbers(buffer.take(9, 0)) == [0, 1, 2, 3]
-    buffer.offer(numbered(4, 8))
+    assert numbers(buffer.take(4, 0)) == [0, 1, 2, 3]
+    buffer.offer(polls(4, 8))
     buffer.keep(60)
     assert buffer.dropped == 4
     assert drained(buffer) == list(range(12))
@@ -284,8 +325,8 @@ def test_a_row_that_can_not_be_read_is_dropped_and_counted(
     opened: Opened, tmp_path: Path, data: bytes
 ) -> None:
     stored = opened(tmp_path / "b.db")
-    stored.add(numbered(3))
-    stored.add(numbered(2, 3))
+    stored.add([numbered(3)])
+    stored.add([numbered(2, 3)])
     stored._db.execute("UPDATE readings SET data = ? WHERE id = 1", (data,))
     buffer = Buffer()
     buffer.stored = stored
@@ -296,7 +337,7 @@ def test_a_row_that_can_not_be_read_is_dropped_and_counted(
 def test_a_value_of_a_changed_tag_keeps_its_meaning(opened: Opened, tmp_path: Path) -> None:
     stored = opened(tmp_path / "b.db")
     before = tag("t", type="uint16", scale=0.1, description="before")
-    stored.add([reading(21.5, tag=before)])
+    stored.add([[reading(21.5, tag=before)]])
     stored.close()
     for now, kind in (
         (tag("t", type="uint16"), "float64"),
@@ -304,7 +345,7 @@ def test_a_value_of_a_changed_tag_keeps_its_meaning(opened: Opened, tmp_path: Pa
         (tag("t", type="uint16", scale=0.1, description="after"), "uint16"),
     ):
         again = opened(tmp_path / "b.db", known=[now])
-        [found] = again.first()
+        [found] = again.first(1)
         assert (found.value, found.tag.type) == (21.5, kind)
         again.close()
 
@@ -323,7 +364,7 @@ def test_nothing_is_lost_or_reordered(
     offered = 0
     for step in [*steps, "restart"]:
         if step == "offer":
-            buffer.offer(numbered(3, offered))
+            buffer.offer(polls(3, offered))
             offered += 3
         elif step == "take":
             buffer.take(2, 0)

@@ -21,7 +21,7 @@ from holdfast.runtime.stop import Stop
 from support import wire
 from support.brokers import free_port
 from support.line_protocol import Point, parsed
-from support.readings import numbered, reading, tag
+from support.readings import numbered, polls, reading, tag
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -254,7 +254,7 @@ def test_a_receiver_that_never_answers_does_not_hold_up_a_stop(
         sending = Sending("db", output, buffer, lambda: opened)
         thread = threading.Thread(target=sending.run, args=[stop])
         thread.start()
-        buffer.offer(numbered(3))
+        buffer.offer(polls(3))
         connection, _ = listener.accept()
         with connection:
             assert connection.recv(65536).startswith(b"POST")
@@ -262,5 +262,5 @@ def test_a_receiver_that_never_answers_does_not_hold_up_a_stop(
             thread.join(wire.DEADLINE)
             assert not thread.is_alive()
     stored = Stored(tmp_path / "b.db", 2**30, lambda _, name: find[name])
-    assert [each.value for each in stored.first()] == [0, 1, 2]
+    assert [each.value for each in stored.first(1)] == [0, 1, 2]
     stored.close()

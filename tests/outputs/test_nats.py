@@ -16,7 +16,7 @@ from holdfast.scanner.publish import nats_output as output_module
 from holdfast.scanner.publish.nats_output import NatsOutput
 from support import wire
 from support.nats_bus import Caller
-from support.readings import TIME, numbered, reading, tag
+from support.readings import TIME, numbered, polls, reading, tag
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -88,15 +88,15 @@ def test_nothing_is_lost_when_the_server_is_away(
     try:
         with Caller(own_nats.url) as caller:
             inbox = caller.listen("modbus.data.pump")
-            buffer.offer(numbered(3))
+            buffer.offer(polls(3))
             assert [inbox.next()["value"] for _ in range(3)] == [0, 1, 2]
         own_nats.kill()
-        buffer.offer(numbered(2000, 3))
+        buffer.offer(polls(2000, 3))
         wire.until(lambda: sending.status()["connected"] is False, "the server is missed")
         own_nats.start()
         with Caller(own_nats.url) as caller:
             inbox = caller.listen("modbus.data.pump")
-            buffer.offer(numbered(1, 2003))
+            buffer.offer(polls(1, 2003))
             wire.until(lambda: not len(buffer), "all is sent")
             found = [inbox.next()["value"]]
             while found[-1] != 2003:
@@ -136,11 +136,11 @@ def test_a_frozen_server_does_not_hold_up_a_stop(
     sending = Sending("nats", output, buffer)
     thread = threading.Thread(target=sending.run, args=[stop])
     thread.start()
-    buffer.offer(numbered(1))
+    buffer.offer(polls(1))
     counted = sending.status
     wire.until(lambda: "'sent': 1" in str(counted()["readings"]), "it is connected")
     own_nats.freeze()
-    buffer.offer(numbered(1))
+    buffer.offer(polls(1))
     stop.set()
     thread.join(wire.DEADLINE)
     own_nats.thaw()

@@ -12,7 +12,7 @@ from holdfast.outputs import sending as module
 from holdfast.outputs.buffer_file import Stored
 from holdfast.runtime.stop import Stop
 from support import wire
-from support.readings import numbered, numbers, tag
+from support.readings import numbers, polls, tag
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -119,7 +119,7 @@ def test_a_receiver_without_readings_has_its_turn_every_second(
 
 def test_everything_is_sent_in_order(output: Running) -> None:
     for start in range(0, 5000, 500):
-        output.buffer.offer(numbered(500, start))
+        output.buffer.offer(polls(500, start))
     wire.until(lambda: len(output.receiver.sent) == 5000, "all is sent")
     assert output.receiver.sent == list(range(5000))
     assert output.sending.status() == {
@@ -150,12 +150,12 @@ def test_nothing_is_lost_in_an_outage(
     output = Running(tmp_path / "b.db" if with_file else None)
     try:
         output.receiver.error = OSError("no route to host")
-        output.buffer.offer(numbered(1500))
+        output.buffer.offer(polls(1500))
         wire.until(lambda: output.receiver.attempts >= 3, "it is tried again")
         status = output.sending.status()
         assert (status["connected"], status["waiting"]) == (False, 1500)
         assert status["last_error"] == "no route to host"
-        output.buffer.offer(numbered(500, 1500))
+        output.buffer.offer(polls(500, 1500))
         output.receiver.error = None
         wire.until(lambda: len(output.receiver.sent) == 2000, "all is sent")
         assert output.receiver.sent == list(range(2000))
@@ -187,17 +187,17 @@ def test_what_is_refused_is_counted_and_not_tried_again(
     output: Running, caplog: pytest.LogCaptureFixture
 ) -> None:
     output.receiver.error = Refused("HTTP 400")
-    output.buffer.offer(numbered(3))
+    output.buffer.offer(polls(3))
     wire.until(lambda: refused(output) == 3, "it is refused")
     output.receiver.error = None
-    output.buffer.offer(numbered(2, 3))
+    output.buffer.offer(polls(2, 3))
     wire.until(lambda: output.receiver.sent == [3, 4], "the rest is sent")
     assert count(caplog, "output_refused") == 1
 
 
 def test_of_a_step_that_is_refused_in_part_the_rest_counts_as_sent(output: Running) -> None:
     output.receiver.error = Refused("of another type", 1)
-    output.buffer.offer(numbered(3))
+    output.buffer.offer(polls(3))
     wire.until(lambda: refused(output) == 1, "it is refused")
     counted = output.sending.status()["readings"]
     assert counted == {"sent": 2, "refused": 1, "dropped": 0}
@@ -206,7 +206,7 @@ def test_of_a_step_that_is_refused_in_part_the_rest_counts_as_sent(output: Runni
 def test_what_is_refused_at_the_end_is_not_kept(tmp_path: Path) -> None:
     output = Running()
     output.end()
-    output.buffer.offer(numbered(3))
+    output.buffer.offer(polls(3))
     output.buffer.stored = Stored(tmp_path / "b.db", 2**30, lambda *_: tag())
     output.receiver.error = Refused("HTTP 400")
     output.sending._finish()
@@ -217,7 +217,7 @@ def test_what_is_refused_at_the_end_is_not_kept(tmp_path: Path) -> None:
 def test_an_error_that_ends_an_output_leaves_its_values_in_the_file(tmp_path: Path) -> None:
     receiver, buffer = Fake(), Buffer()
     receiver.error = RuntimeError("a bug")
-    buffer.offer(numbered(1500))
+    buffer.offer(polls(1500))
     file = tmp_path / "b.db"
     sending = Sending("out", receiver, buffer, lambda: Stored(file, 2**30, lambda *_: tag()))
     with pytest.raises(RuntimeError, match="a bug"):
@@ -229,7 +229,7 @@ def test_an_error_that_ends_an_output_leaves_its_values_in_the_file(tmp_path: Pa
 
 def test_what_is_left_at_the_end_is_sent() -> None:
     output = Running()
-    output.buffer.offer(numbered(2500))
+    output.buffer.offer(polls(2500))
     output.end()
     assert output.receiver.sent == list(range(2500))
     assert output.receiver.closed == 1
@@ -240,11 +240,11 @@ def test_what_can_not_be_sent_at_the_end_is_in_the_file(
 ) -> None:
     output = Running(tmp_path / "b.db")
     output.receiver.error = OSError("down")
-    output.buffer.offer(numbered(1500))
+    output.buffer.offer(polls(1500))
     output.end()
     assert count(caplog, "output_unsent") == 0
     again = Running(tmp_path / "b.db")
-    again.buffer.offer(numbered(1, 1500))
+    again.buffer.offer(polls(1, 1500))
     wire.until(lambda: len(again.receiver.sent) == 1501, "all is sent")
     again.end()
     assert again.receiver.sent == list(range(1501))
@@ -257,18 +257,50 @@ def test_what_a_slow_disk_can_not_store_at_the_end_is_logged(
     monkeypatch.setattr(module, "STORE_TIMEOUT_S", 0)
     output = Running(tmp_path / "b.db")
     output.receiver.error = OSError("down")
-    output.buffer.offer(numbered(5))
+    output.buffer.offer(polls(5))
     wire.until(lambda: output.receiver.attempts > 0, "it was tried")
     output.end()
     [record] = [record for record in caplog.records if record.message == "output_unsent"]
     assert vars(record)["fields"]["count"] == 5
 
 
+@pytest.mark.parametrize("is_full", [False, True])
+def test_what_waits_for_a_slow_receiver_is_in_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_full: bool
+) -> None:
+    output = Running(tmp_path / "b.db")
+    if is_full:
+        output.buffer.most = 5000
+        monkeypatch.setattr(module, "CHECK_INTERVAL_S", wire.DEADLINE)
+    send, offered = output.receiver.send, 0
+    goes_on = threading.Event()
+
+    def slow(readings: list[Reading]) -> None:
+        nonlocal offered
+        if not goes_on.is_set():
+            output.buffer.offer(polls(1500, offered))
+            offered += 1500
+        send(readings)
+
+    output.receiver.send = slow  # type: ignore[method-assign]
+    output.buffer.offer(polls(1))
+    offered = 1
+    try:
+        wire.until(lambda: output.buffer.stored and output.buffer.stored.count, "it is stored")
+        goes_on.set()
+        wire.until(lambda: len(output.receiver.sent) == offered, "all is sent")
+    finally:
+        goes_on.set()
+        output.end()
+    assert output.receiver.sent == list(range(offered))
+    assert output.buffer.dropped == 0
+
+
 def test_what_there_is_no_room_for_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     output = Running()
     output.receiver.error = OSError("down")
     output.buffer.most = 2
-    output.buffer.offer(numbered(5))
+    output.buffer.offer(polls(5))
     wire.until(lambda: count(caplog, "output_dropped") > 0, "it is logged")
     output.end()
     logged = [record for record in caplog.records if record.message == "output_dropped"]
@@ -278,7 +310,7 @@ def test_what_there_is_no_room_for_is_logged(caplog: pytest.LogCaptureFixture) -
 def test_what_is_lost_at_the_end_is_told(caplog: pytest.LogCaptureFixture) -> None:
     output = Running()
     output.receiver.error = OSError("down")
-    output.buffer.offer(numbered(5))
+    output.buffer.offer(polls(5))
     output.end()
     [record] = [record for record in caplog.records if record.message == "output_unsent"]
     assert vars(record)["fields"]["count"] == 5
@@ -288,7 +320,7 @@ def test_a_buffer_keeps_what_waits_for_the_next_output() -> None:
     """As after a reload with other settings."""
     output = Running()
     output.receiver.error = OSError("down")
-    output.buffer.offer(numbered(5))
+    output.buffer.offer(polls(5))
     wire.until(lambda: output.receiver.attempts > 0, "it is tried")
     output.end()
     output.receiver, output.stop = Fake(), Stop()
@@ -301,11 +333,11 @@ def test_a_file_that_can_not_be_opened_stops_nothing(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     output = Running(tmp_path / "missing" / "b.db")
-    output.buffer.offer(numbered(3))
+    output.buffer.offer(polls(3))
     wire.until(lambda: output.receiver.sent == [0, 1, 2], "all is sent")
     assert "unable to open database file" in str(output.sending.status()["file_error"])
     (tmp_path / "missing").mkdir()
-    output.buffer.offer(numbered(1, 3))
+    output.buffer.offer(polls(1, 3))
     wire.until(lambda: output.sending.status()["file_error"] is None, "the file is opened")
     output.end()
     assert count(caplog, "output_file_failed") == 1

@@ -26,5 +26,10 @@ def numbered(count: int, start: int = 0) -> list[Reading]:
     return [reading(number, TIME + number) for number in range(start, start + count)]
 
 
+def polls(count: int, start: int = 0) -> list[list[Reading]]:
+    """The same, each in a poll of its own."""
+    return [[each] for each in numbered(count, start)]
+
+
 def numbers(readings: list[Reading]) -> list[int]:
     return [reading.value for reading in readings]

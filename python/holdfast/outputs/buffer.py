@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from holdfast.config.models.outputs import MAX_VALUES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from holdfast.outputs.buffer_file import Stored
     from holdfast.polling import Reading
@@ -19,17 +19,27 @@ if TYPE_CHECKING:
 MAX_STEP = 20_000
 """Readings that are stored at once. Each step waits for the disk once."""
 
+MAX_ROW = 1000
+"""Readings in one row of the file, but for the rest of a poll."""
+
 
 class Buffer:
     """Readings in their order. `offer` is for the thread that polls; it never waits for a file.
 
     All other methods are for the thread of the output. The newest `most` readings are in memory;
     with a file, those that can't be sent go there.
+
+    What is taken or stored ends with a whole poll, so that nobody sees half of one.
     """
 
     def __init__(self, most: int = MAX_VALUES) -> None:
         self.most = most
-        self._waiting: deque[Reading] = deque()
+        self._waiting: deque[Sequence[Reading]] = deque()
+        """Polls."""
+        self._count = 0
+        """The readings of these polls."""
+        self._offered = self._seen = 0
+        """All readings that were ever offered: now, and at the last `has_late`."""
         self._batch: list[Reading] = []
         self._is_batch_stored = False
         self._changed = threading.Condition()
@@ -38,39 +48,68 @@ class Buffer:
         self.dropped = 0
         """Readings that were lost because there was no room."""
 
-    def offer(self, readings: Iterable[Reading]) -> None:
-        """Adds readings. If there is no room, the oldest are dropped and counted."""
+    def offer(self, polls: Iterable[Sequence[Reading]]) -> None:
+        """Adds the readings of polls. If there is no room, the oldest are dropped and counted."""
         with self._changed:
-            self._waiting.extend(readings)
-            while len(self._waiting) > self.most:
-                self._waiting.popleft()
-                self.dropped += 1
+            before = self._count
+            for poll in polls:
+                if poll:
+                    self._waiting.append(poll)
+                    self._count += len(poll)
+            self._offered += self._count - before
+            while (excess := self._count - self.most) > 0:
+                oldest = self._waiting.popleft()
+                if excess < len(oldest):
+                    self._waiting.appendleft(oldest[excess:])
+                gone = min(excess, len(oldest))
+                self._count -= gone
+                self.dropped += gone
             self._changed.notify_all()
 
     def __len__(self) -> int:
         stored = 0 if self.stored is None else self.stored.count
         with self._changed:
-            return len(self._waiting) + (0 if self._is_batch_stored else len(self._batch)) + stored
+            return self._count + (0 if self._is_batch_stored else len(self._batch)) + stored
 
     def take(self, max_readings: int, timeout: float) -> list[Reading]:
         """Returns the oldest readings. Waits for the first up to `timeout` seconds.
 
-        Returns the same readings again until `done` is called. Raises `OSError` if the file fails.
+        They may be more than `max_readings`, by the rest of a poll. Returns the same readings again
+        until `done` is called. Raises `OSError` if the file fails.
         """
         if self._batch:
             return self._batch
         # The readings in the file are older than those in memory.
         if self.stored is not None and self.stored.count:
-            self._batch, self._is_batch_stored = self.stored.first(), True
+            self._batch, self._is_batch_stored = self.stored.first(max_readings), True
             self.dropped += self.stored.damaged
             self.stored.damaged = 0
             return self._batch
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._is_woken, timeout)
             self._is_woken = False
-            count = min(max_readings, len(self._waiting))
-            self._batch = [self._waiting.popleft() for _ in range(count)]
+            self._batch = self._pop(max_readings)
         return self._batch
+
+    def _pop(self, least: int) -> list[Reading]:
+        """Removes whole polls with so many readings, or all. Called with the lock."""
+        found: list[Reading] = []
+        while self._waiting and len(found) < least:
+            found += self._waiting.popleft()
+        self._count -= len(found)
+        return found
+
+    @property
+    def is_filling(self) -> bool:
+        """Whether readings fill more than half of the memory."""
+        return 2 * self._count > self.most
+
+    def has_late(self) -> bool:
+        """Whether readings wait in memory since the last call."""
+        with self._changed:
+            is_late = self._offered - self._count < self._seen
+            self._seen = self._offered
+        return is_late
 
     def done(self) -> None:
         """Removes the readings that `take` returned. Raises `OSError` if the file fails."""
@@ -94,30 +133,32 @@ class Buffer:
             return
         until = time.monotonic() + seconds
         with self._changed:
-            left = len(self._waiting)
+            left = self._count
         while time.monotonic() < until:
             # The batch goes first: it is older than the readings that wait.
             if self._batch and not self._is_batch_stored:
-                moved = self._batch
+                rows = [self._batch]
             else:
+                rows, end = [], max(0, left - step)
                 with self._changed:
-                    count = min(step, left, len(self._waiting))
-                    moved = [self._waiting.popleft() for _ in range(count)]
-                left -= count
-            if not moved:
+                    while left > end and (row := self._pop(min(MAX_ROW, left - end))):
+                        rows.append(row)
+                        left -= len(row)
+            if not rows:
                 return
             try:
-                self.dropped += self.stored.add(moved)
+                self.dropped += self.stored.add(rows)
             except OSError:
-                if moved is not self._batch:
-                    self._put_back(moved)
+                if rows[0] is not self._batch:
+                    self._put_back(*rows)
                 raise
-            if moved is self._batch:
+            if rows[0] is self._batch:
                 self._batch = []
 
-    def _put_back(self, readings: list[Reading]) -> None:
+    def _put_back(self, *rows: list[Reading]) -> None:
         with self._changed:
-            self._waiting.extendleft(reversed(readings))
+            self._waiting.extendleft(row for row in reversed(rows) if row)
+            self._count += sum(map(len, rows))
 
     def detach(self) -> None:
         """Closes the file. A batch from memory waits again; one from the file stays there."""

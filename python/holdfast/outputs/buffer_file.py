@@ -1,6 +1,6 @@
 """A file with readings that could not be sent yet.
 
-SQLite keeps it valid after a power cut. One row has the readings of one step, so that many values
+SQLite keeps it valid after a power cut. One row has the readings of many polls, so that many values
 cost few writes.
 """
 
@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 LOCK_TIMEOUT_S = 1.0
 """Seconds to wait for a file that is in use, by default."""
 
-MAX_ROW = 1000
-"""Readings in one row, which are sent together."""
-
 _CREATE = """
 CREATE TABLE IF NOT EXISTS readings (
     id INTEGER PRIMARY KEY AUTOINCREMENT, count INTEGER NOT NULL, data BLOB NOT NULL
@@ -50,8 +47,8 @@ class Stored:
         """How many readings were removed because they could not be read."""
         self._max_bytes, self._find = max_bytes, find
         self._bytes = 0
-        self._first: int | None = None
-        """The row that `first` returned."""
+        self._last = 0
+        """The last row that `first` returned."""
         with file_errors(file):
             self._db = sqlite3.connect(
                 file, timeout=lock_timeout, isolation_level=None, check_same_thread=False
@@ -63,24 +60,29 @@ class Stored:
             self._db.execute(_CREATE)
             self._recount()
 
-    def add(self, readings: Sequence[Reading]) -> int:
-        """Stores readings durably, all or none. Returns how many were dropped for want of room."""
+    def add(self, rows: Sequence[Sequence[Reading]]) -> int:
+        """Stores rows of readings durably, all or none. Returns how many were dropped for want of
+        room.
+        """
         dropped = 0
         # Once for each tag: most readings share theirs.
-        tags = {id(reading.tag): reading.tag for reading in readings}
+        tags = {id(reading.tag): reading.tag for row in rows for reading in row}
         meanings = {of: meaning_of(tag) for of, tag in tags.items()}
-        plain = [
-            (device, tag.name, value, time, fault, undecoded, meanings[id(tag)])
-            for device, tag, value, time, fault, undecoded in readings
+        encoded = [
+            msgspec.msgpack.encode(
+                [
+                    (device, tag.name, value, time, fault, undecoded, meanings[id(tag)])
+                    for device, tag, value, time, fault, undecoded in row
+                ]
+            )
+            for row in rows
         ]
-        steps = [plain[at : at + MAX_ROW] for at in range(0, len(plain), MAX_ROW)]
-        rows = [(len(step), msgspec.msgpack.encode(step)) for step in steps]
         # The rollback may undo what is counted here.
         with file_errors(self.file, self._recount), self._db:
             self._db.execute("BEGIN")
-            for count, data in rows:
+            for count, data in zip(map(len, rows), encoded, strict=True):
                 while self._bytes + len(data) > self._max_bytes and self.count:
-                    dropped += self._remove("(SELECT min(id) FROM readings)")
+                    dropped += self._remove("id = (SELECT min(id) FROM readings)")
                 if len(data) > self._max_bytes:
                     dropped += count
                     continue
@@ -89,30 +91,40 @@ class Stored:
                 self._bytes += len(data)
         return dropped
 
-    def first(self) -> list[Reading]:
-        """The oldest readings that were stored together; empty if there are none.
+    def first(self, most: int) -> list[Reading]:
+        """The oldest readings, in whole rows: one, and more up to `most` readings. Empty if there
+        are none.
 
         Removes those that can't be read, and counts them in `damaged`.
         """
-        query = "SELECT id, data, count FROM readings ORDER BY id LIMIT 1"
+        query = "SELECT id, data, count FROM readings WHERE id > ? ORDER BY id LIMIT 1"
+        found: list[Reading] = []
+        self._last = 0
         while True:
             with file_errors(self.file):
-                row = self._db.execute(query).fetchone()
-            if row is None:
+                row = self._db.execute(query, (self._last,)).fetchone()
+            if row is None and not found:
                 self.count = self._bytes = 0
-                return []
-            self._first, data, count = row
+            if row is None or (found and len(found) + row[2] > most):
+                return found
+            id, data, count = row
             try:
-                return [self._reading(*plain) for plain in msgspec.msgpack.decode(data)]
+                readings = [self._reading(*plain) for plain in msgspec.msgpack.decode(data)]
             except (msgspec.MsgspecError, TypeError, ValueError):
+                if found:
+                    return found
+                self._last = id
                 self.remove_first()
                 self.damaged += count
+            else:
+                found += readings
+                self._last = id
 
     def remove_first(self) -> None:
         """Removes what `first` returned last, unless `add` has dropped it since."""
         with file_errors(self.file, self._recount), self._db:
             self._db.execute("BEGIN")
-            self._remove("?", self._first)
+            self._remove("id <= ?", self._last)
         if not self.count:
             # The readings are removed already. If this fails, pages stay free for the next ones.
             with contextlib.suppress(sqlite3.Error):
@@ -123,15 +135,14 @@ class Stored:
         """Closes the file."""
         self._db.close()
 
-    def _remove(self, id: str, *parameters: int | None) -> int:
-        row = self._db.execute(
-            f"DELETE FROM readings WHERE id = {id} RETURNING count, length(data)", parameters
-        ).fetchone()
-        if row is None:
-            return 0
-        self.count -= row[0]
-        self._bytes -= row[1]
-        return int(row[0])
+    def _remove(self, which: str, *parameters: int) -> int:
+        rows = self._db.execute(
+            f"DELETE FROM readings WHERE {which} RETURNING count, length(data)", parameters
+        ).fetchall()
+        removed = sum(count for count, _ in rows)
+        self.count -= removed
+        self._bytes -= sum(size for _, size in rows)
+        return int(removed)
 
     def _recount(self) -> None:
         query = "SELECT coalesce(sum(count), 0), coalesce(sum(length(data)), 0) FROM readings"

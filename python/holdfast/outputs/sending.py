@@ -25,10 +25,10 @@ MAX_PAUSE_S = 10.0
 """Seconds between attempts to send. Each failure doubles the pause, up to the maximum."""
 
 MAX_READINGS = 1000
-"""Limit of readings in one call of `Receiver.send`."""
+"""Limit of readings in one call of `Receiver.send`, but for the rest of a poll."""
 
 CHECK_INTERVAL_S = 1.0
-"""Interval of moving readings to the file during an outage."""
+"""Interval of moving readings to the file, in an outage or while the receiver does not keep up."""
 
 DROPPED_INTERVAL_S = 60.0
 """Interval of logging that readings were dropped."""
@@ -101,6 +101,7 @@ class Sending:
         self._sent = self._refused = 0
         self._logged_dropped, self._logged_at = buffer.dropped, -inf
         self._stopped_at = inf
+        self._looked_at = -inf
         self._backoff = Backoff(FIRST_PAUSE_S, MAX_PAUSE_S, jitter=True)
         self._pause = 0.0
         self._last_error: str | None = None
@@ -116,6 +117,7 @@ class Sending:
                 self._use_file()
                 if not self._step(stop):
                     self._wait(stop)
+                self._keep_late()
                 self._log_dropped()
             self._finish()
         except Exception:
@@ -207,6 +209,17 @@ class Sending:
             self._keep(CHECK_INTERVAL_S)
             self._log_dropped()
             stop.wait(min(CHECK_INTERVAL_S, left))
+
+    def _keep_late(self) -> None:
+        """Moves readings to the file if they come faster than they are sent, or wait for those in
+        the file: a crash would lose them, or memory not have room for them.
+        """
+        is_late = self._buffer.is_filling
+        if (now := time.monotonic()) >= self._looked_at + CHECK_INTERVAL_S:
+            self._looked_at = now
+            is_late |= self._buffer.has_late()
+        if is_late:
+            self._keep(CHECK_INTERVAL_S)
 
     def _finish(self) -> None:
         """Sends remaining readings for `STOP_TIMEOUT_S`, then moves the rest to the file."""

@@ -265,10 +265,10 @@ class TagValues:
                 self.answers += 1
         for output in self._outputs.values():
             only = output.settings.devices
-            readings = [
-                reading
-                for poll in polls
-                if only is None or poll.device in only
-                for reading in poll.readings
-            ]
-            output.buffer.offer(output.changes.of(readings))
+            output.buffer.offer(
+                [
+                    output.changes.of(poll.readings)
+                    for poll in polls
+                    if only is None or poll.device in only
+                ]
+            )
