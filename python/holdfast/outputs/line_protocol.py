@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from holdfast.tags.scale import RegisterScale
 from holdfast.tags.text import plain
 
 if TYPE_CHECKING:
@@ -29,8 +30,10 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
     for device, tag, value, time, _, _ in readings:
         at = round(time * 1_000_000) * 1000
         fields = points.setdefault((device, at), [])
-        # Some integers of this type do not fit, so that all are floats: a field has one kind.
-        shown = plain(tag, _as_float(value) if tag.of_type.base == "uint64" else value)
+        # A field has one kind. Some integers of this type do not fit, and whether a scale in a
+        # register makes a float depends on the register: all are floats.
+        is_float = tag.of_type.base == "uint64" or isinstance(tag.scale, RegisterScale)
+        shown = plain(tag, _as_float(value) if is_float else value)
         fields += [f"{key.translate(_KEY)}={written}" for key, written in _fields(tag.name, shown)]
     name = measurement.translate(_NAME)
     more = "".join(f",{key.translate(_KEY)}={_tag(value)}" for key, value in tags.items())
