@@ -190,6 +190,21 @@ def test_a_refused_message_is_counted_and_the_others_are_published(tmp_path: Pat
         wire.until(lambda: plant.status()["not_accepted"] == 3, "counted")
 
 
+def test_a_refused_message_that_has_no_value_is_reported_too(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    rules = tmp_path / "acl"
+    rules.write_text("topic readwrite plant/#\n")
+    with Plant(tmp_path, "allow_anonymous true", f"acl_file {rules}") as plant:
+        plant.device()
+        plant.run(discovery="homeassistant")
+        wire.until(lambda: plant.status().get("not_accepted", 0) > 0, "counted")
+    first = next(each for each in caplog.records if each.message == "output_not_accepted")
+    fields = vars(first)["fields"]
+    assert (fields["output"], fields["reason"]) == ("home", "Not authorized")
+    assert fields["topic"].startswith("homeassistant/")
+
+
 def test_a_broker_that_wants_a_password_gets_it(tmp_path: Path) -> None:
     users = tmp_path / "users"
     subprocess.run(

@@ -56,7 +56,9 @@ QUICK_ACK: int | None = getattr(socket, "TCP_QUICKACK", None)
 
 
 class Connection(BrokerClient):
-    """One connection. `on_command` is called for each message, with whether it was retained."""
+    """One connection. `on_command` is called for each message, with whether it was retained, and
+    `on_refused` for each one that the broker did not accept, and won't later, with the reason.
+    """
 
     def __init__(
         self,
@@ -64,6 +66,7 @@ class Connection(BrokerClient):
         client_id: str,
         waiter: Waiter,
         on_command: Callable[[Publish, bool], None],
+        on_refused: Callable[[Message, str], None],
         *,
         qos: int,
         proves: bool,
@@ -72,7 +75,7 @@ class Connection(BrokerClient):
         has answered a ping that follows them; otherwise, when they are written.
         """
         super().__init__(settings, client_id, waiter, session_expiry=0)
-        self._on_command = on_command
+        self._on_command, self._on_refused = on_command, on_refused
         self._qos, self._proves = qos, proves
         self._max_in_flight = MAX_IN_FLIGHT[settings.version]
         self._largest: int | None = None
@@ -175,7 +178,8 @@ class Connection(BrokerClient):
         places = list(range(first, delivery.sent))
         large = [place for place in places if not self._fits(delivery.messages[place])]
         for place in large:
-            delivery.refuse(place, f"it has more than the {self._largest} bytes that are allowed")
+            reason = f"it has more than the {self._largest} bytes that are allowed"
+            self._refused(delivery, place, reason)
         if large:
             places = [place for place in places if place not in large]
             some = [some[place - first] for place in places]
@@ -243,8 +247,12 @@ class Connection(BrokerClient):
         if code == QUOTA_EXCEEDED:
             self.end(f"the broker did not accept a message: {reason}")
             return False
-        delivery.refuse(index, reason)
+        self._refused(delivery, index, reason)
         return delivery.is_done
+
+    def _refused(self, delivery: Delivery, index: int, reason: str) -> None:
+        self._on_refused(delivery.messages[index], reason)
+        delivery.confirm(index)
 
     def _received(self, first: int, body: bytes | bytearray) -> None:
         message = parse_publish(first, body, len(body), five=self._five)

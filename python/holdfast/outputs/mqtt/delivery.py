@@ -65,8 +65,6 @@ class Delivery:
         """How many were sent."""
         self.confirmed = 0
         """How many were confirmed, without a gap; read by other threads."""
-        self.refused: list[tuple[Message, str]] = []
-        """Those that the broker did not accept, and why."""
         self._early: set[int] = set()
 
     @property
@@ -84,8 +82,3 @@ class Delivery:
             self._early.discard(index)
             index += 1
         self.confirmed = index
-
-    def refuse(self, index: int, reason: str) -> None:
-        """Notes that the broker did not accept a message, and won't later."""
-        self.refused.append((self.messages[index], reason))
-        self.confirm(index)

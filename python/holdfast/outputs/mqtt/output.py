@@ -86,6 +86,7 @@ class MqttOutput(BrokerReceiver):
             self._client_id,
             self._availability.of_output(OFFLINE),
             self._on_message,
+            self._on_refused,
             stop,
             qos=self._settings.qos,
             writes=self._settings.writes,

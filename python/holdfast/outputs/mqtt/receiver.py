@@ -12,7 +12,7 @@ from holdfast.outputs.sending import Receiver
 
 if TYPE_CHECKING:
     from holdfast.config.models.outputs import MqttOutputConfig, SparkplugConfig
-    from holdfast.outputs.mqtt.delivery import Delivery
+    from holdfast.outputs.mqtt.delivery import Delivery, Message
     from holdfast.outputs.mqtt.session import Session
     from holdfast.runtime.stop import Stop
 
@@ -75,14 +75,14 @@ class BrokerReceiver(Receiver):
         except OSError:
             self._disconnect()
             raise
-        finally:
-            self._not_accepted += len(delivery.refused)
-            for message, reason in delivery.refused[:1]:
-                log_lines.refused(
-                    "output_not_accepted",
-                    kind=self._name,
-                    output=self._name,
-                    topic=message.topic[2:].decode(),
-                    reason=reason,
-                    count=len(delivery.refused),
-                )
+
+    def _on_refused(self, message: Message, reason: str) -> None:
+        """Reports any message, not only one of values. Called by the thread of the connection."""
+        self._not_accepted += 1
+        log_lines.refused(
+            "output_not_accepted",
+            kind=self._name,
+            output=self._name,
+            topic=message.topic[2:].decode(),
+            reason=reason,
+        )

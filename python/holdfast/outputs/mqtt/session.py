@@ -56,6 +56,7 @@ class Session:
         client_id: str,
         will: Message | None,
         on_command: Callable[[Publish, bool], None],
+        on_refused: Callable[[Message, str], None],
         stop: Stop,
         *,
         qos: int,
@@ -63,14 +64,14 @@ class Session:
         writes: bool,
         proves: bool = False,
     ) -> None:
-        """`qos` is of all messages, and of the will unless it has its own. For `proves`, see
-        `Connection`.
+        """`qos` is of all messages, and of the will unless it has its own. For `on_refused` and
+        `proves`, see `Connection`.
 
         With `writes`, messages are commands. If this process stood still, the connection ends, and
         the broker drops the commands that waited: they are too late.
         """
         self._standstill = Standstill("output") if writes else None
-        self._on_command = on_command
+        self._on_command, self._on_refused = on_command, on_refused
         self._settings, self._qos, self._proves = settings, qos, proves
         self._will_qos = qos if will_qos is None else will_qos
         self._ending = Ending.DISCONNECT
@@ -156,6 +157,7 @@ class Session:
                 client_id,
                 waiter,
                 self._take,
+                self._on_refused,
                 qos=self._qos,
                 proves=self._proves,
             )

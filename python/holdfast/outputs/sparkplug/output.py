@@ -105,6 +105,7 @@ class SparkplugOutput(BrokerReceiver):
             self._client_id,
             self._node.death(),
             self._on_message,
+            self._on_refused,
             stop,
             qos=0,
             will_qos=1,
