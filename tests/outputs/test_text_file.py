@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import csv
 import json
+import sqlite3
+import sys
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -199,6 +202,19 @@ def test_a_database_has_one_row_for_each_value(tmp_path: Path) -> None:
     values = [21.5, 1, "[1,2]", 'x,"y"\nz', "Af8=", None, float(2**64 - 1)]
     assert [row[3] for row in rows] == values
     assert rows[5][5] == "exception 02 (Illegal Data Address)"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no open database")
+@pytest.mark.parametrize("removed", ["a.db", "a.db*"])
+def test_a_database_that_is_removed_is_made_again(tmp_path: Path, removed: str) -> None:
+    database = Database(settings(tmp_path / "a.db", "sqlite"))
+    database.send(READINGS[:1])
+    for file in tmp_path.glob(removed):
+        file.unlink()
+    database.send(READINGS[1:2])
+    database.close()
+    with closing(sqlite3.connect(tmp_path / "a.db")) as again:
+        assert again.execute("SELECT tag FROM readings").fetchall() == [("on",)]
 
 
 def test_old_rows_go_when_a_database_is_too_large(tmp_path: Path) -> None:

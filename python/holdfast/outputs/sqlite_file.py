@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from typing import TYPE_CHECKING, Any
 
@@ -33,6 +34,8 @@ class Database(Receiver):
     def __init__(self, settings: FileConfig) -> None:
         self._file, self._max_bytes = settings.file, settings.max_bytes
         self._db: sqlite3.Connection | None = None
+        self._status: os.stat_result | None = None
+        """Of the file that is open."""
 
     def send(self, readings: list[Reading]) -> None:
         """Inserts rows. They survive a power cut when this returns."""
@@ -56,12 +59,23 @@ class Database(Receiver):
         return {"file": str(self._file)}
 
     def _opened(self) -> sqlite3.Connection:
+        """The database; a new one if somebody has removed the file."""
+        if self._db is not None and not self._is_in_place():
+            self.close()
         if self._db is None:
             self._db = sqlite3.connect(self._file, timeout=5.0, check_same_thread=False)
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
             self._db.execute("PRAGMA journal_mode=WAL")
             self._db.executescript(_CREATE)
+            self._status = self._file.stat()
         return self._db
+
+    def _is_in_place(self) -> bool:
+        try:
+            found = self._file.stat()
+        except OSError:
+            return False
+        return self._status is not None and os.path.samestat(found, self._status)
 
     def _shrink(self, db: sqlite3.Connection) -> None:
         """Removes the oldest rows if there are too many."""
