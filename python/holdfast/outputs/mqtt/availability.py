@@ -1,4 +1,4 @@
-"""What an MQTT output says of itself and of devices: online, or offline. All of it is retained."""
+"""What an MQTT output says of itself and of devices: online, or offline."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ ONLINE, OFFLINE = b"online", b"offline"
 class Availability:
     """What was published of one output and its devices."""
 
-    def __init__(self, names: TopicNames, site: Site) -> None:
-        self._names, self._site = names, site
+    def __init__(self, names: TopicNames, site: Site, *, retain: bool) -> None:
+        self._names, self._site, self._retain = names, site, retain
         self._answering: dict[str, bool] = {}
         """Of each device, whether it answered when that was published last."""
         self._answers = -1
@@ -27,7 +27,7 @@ class Availability:
 
     def of_output(self, payload: bytes) -> Message:
         """The message about the output itself; with `OFFLINE` it is also the will."""
-        return Message(packed_topic(self._names.status), payload, True)
+        return Message(packed_topic(self._names.status), payload, self._retain)
 
     def begin(self) -> None:
         """Forgets what was published: a broker may have lost it."""
@@ -58,4 +58,4 @@ class Availability:
             self._answers = now
         payload = ONLINE if answering else OFFLINE
         topics = map(self._names.of_availability, changed)
-        return [Message(packed_topic(topic), payload, True) for topic in topics]
+        return [Message(packed_topic(topic), payload, self._retain) for topic in topics]

@@ -37,7 +37,10 @@ class MqttOutput(BrokerReceiver):
         self._messages: Sequence[Message] = ()
         self._commands = Commands(name, self._broker, self._topics, site)
         self._tags: dict[str, set[str]] = {}
-        self._availability = Availability(self._topics, site)
+        # Home Assistant looks at availability only after discovery, so it must be retained. A will
+        # that is retained would keep a broker without retained messages from any connection.
+        self._retains = settings.retain or settings.discovery is not None
+        self._availability = Availability(self._topics, site, retain=self._retains)
         self._discovery = None if settings.discovery is None else Discovery(name, settings)
         self._entities: dict[str, bytes] = {}
         self._found: deque[str] = deque()
@@ -146,7 +149,7 @@ class MqttOutput(BrokerReceiver):
     def _topics_of(self, tags: Mapping[str, set[str]]) -> set[str]:
         """The retained topics of devices and tags."""
         names = self._topics
-        found = {names.of_availability(device) for device in tags}
+        found = {names.of_availability(device) for device in tags if self._retains}
         if not self._settings.retain:
             return found
         if self._settings.payload == "device":
