@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -15,6 +16,7 @@ from support import wire
 from support.config_folder import Folder, written
 from support.mqtt_rig import Rig, Running, settings
 from support.nats_bus import logged
+from support.tcp_proxy import Proxy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -70,6 +72,22 @@ def test_a_plain_value_is_written_by_its_tag(
     probe.publish(TOPIC, text)
     running.wait_until_received(1)
     assert rig.registers(4, len(values)) == values
+
+
+def test_a_value_that_is_published_during_an_outage_is_written(rig: Rig) -> None:
+    broker = rig.broker()
+    with closing(Proxy(broker.port)) as proxy:
+        mapped = {TOPIC: MappedTag("plant", Tag("tag", "holding_registers", 4))}
+        running = rig.run(config(proxy.url, REGISTER), mapped=mapped)
+        running.wait_until_connected()
+        probe = rig.probe(broker)
+        probe.publish(TOPIC, "10", retain=True)
+        running.wait_until_received(1)
+        proxy.down()
+        probe.publish(TOPIC, "20", retain=True)
+        proxy.up()
+        running.wait_until_received(2)
+    assert rig.registers(4, 1) == [20]
 
 
 def test_a_coil_takes_words(rig: Rig) -> None:

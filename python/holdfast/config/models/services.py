@@ -206,7 +206,7 @@ class MappingConfig(Model):
 
     topic: TopicName
     """The topic, without wildcards."""
-    qos: QualityOfService = 0
+    qos: QualityOfService = 1
     """The requested quality of service."""
     memory: Name
     """The memory that is written."""
