@@ -153,7 +153,11 @@ def test_values_wait_in_a_file_over_a_restart(plant: Plant) -> None:
     assert seen == [1, 2, 3]
 
 
-def test_a_broker_that_has_lost_its_memory_gets_all_values_again(plant: Plant) -> None:
+@pytest.mark.parametrize("interval", [0.05, 3600])
+def test_a_broker_that_has_lost_its_memory_gets_all_values_again(
+    plant: Plant, interval: float
+) -> None:
+    plant.interval = interval
     device = plant.device()
     device.set(215)
     probe = plant.probe("plant/#")

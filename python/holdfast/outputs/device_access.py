@@ -62,7 +62,7 @@ class Site(Protocol):
         """The last reading of each tag."""
 
     def refresh(self) -> None:
-        """Has the next value of each tag published, also if it is unchanged."""
+        """Has the last value of each tag published again, and those not known yet once they are."""
 
     def write(
         self,

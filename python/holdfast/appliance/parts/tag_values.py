@@ -25,7 +25,7 @@ from holdfast.polling.readings import Reader
 from holdfast.runtime.heartbeat import Heartbeat
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
     from holdfast._core import Results
     from holdfast.config import Config
@@ -80,6 +80,17 @@ class _Output:
     settings: Output
     changes: Changes
     buffer: Buffer
+
+    def offer(self, polls: Iterable[tuple[str, Sequence[Reading]]]) -> None:
+        """Offers what is published of the polls of devices."""
+        only = self.settings.devices
+        self.buffer.offer(
+            [
+                self.changes.of(readings)
+                for device, readings in polls
+                if only is None or device in only
+            ]
+        )
 
 
 class TagValues:
@@ -204,10 +215,11 @@ class TagValues:
             return dict(self._answering)
 
     def refresh(self, output: str) -> None:
-        """Publishes the next value of each tag to an output, also if unchanged. Thread-safe."""
+        """Offers the last value of each tag to an output again. Thread-safe."""
         with self._lock:
-            if output in self._outputs:
-                self._outputs[output].changes.forget(self._readers)
+            if (known := self._outputs.get(output)) is not None:
+                known.changes.forget(self._readers)
+                known.offer(self._latest.items())
 
     def heartbeat(self) -> ThreadHeartbeat | None:
         """The heartbeat of the thread; `None` before the start."""
@@ -264,11 +276,4 @@ class TagValues:
                 self._answering[poll.device] = answers
                 self.answers += 1
         for output in self._outputs.values():
-            only = output.settings.devices
-            output.buffer.offer(
-                [
-                    output.changes.of(poll.readings)
-                    for poll in polls
-                    if only is None or poll.device in only
-                ]
-            )
+            output.offer([(poll.device, poll.readings) for poll in polls])
