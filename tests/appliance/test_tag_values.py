@@ -14,6 +14,7 @@ import holdfast
 from holdfast.appliance import Appliance
 from holdfast.appliance.parts import tag_values
 from holdfast.appliance.parts.tag_values import TagValues
+from holdfast.appliance.services.supervision import Supervisor
 from holdfast.config import load
 from holdfast.events import log_lines
 from holdfast.outputs.buffer_file import Stored
@@ -103,6 +104,32 @@ def test_changes_of_values_reach_a_file(
     assert values(tmp_path, "power") == [21.5, 0.1, 0.2, 0.3]
     assert values(tmp_path, "on") == [False, True, False, True]
     assert len(values(tmp_path, "label")) == 1
+
+
+def test_what_is_read_while_outputs_end_reaches_none_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = settings(0)
+    made["outputs"]["other"] = made["outputs"]["out"] | {"file": "other.jsonl"}
+    answered, value, stop = [0], [1], Supervisor.stop
+
+    def answer(request: wire.Frame) -> bytes:
+        answered[0] += 1
+        return data(request, value[0])
+
+    def slow_stop(output: Supervisor) -> None:
+        stop(output)
+        if value == [1]:
+            value[0], end = 2, answered[0] + 20
+            wire.until(lambda: answered[0] > end, "the device is still polled")
+
+    monkeypatch.setattr(Supervisor, "stop", slow_stop)
+    with Fake(answer) as fake:
+        made["devices"]["m"]["url"] = f"tcp://127.0.0.1:{fake.port}"
+        with Appliance(load(saved(tmp_path, made))):
+            for name in ("out.jsonl", "other.jsonl"):
+                wire.until(lambda: values(tmp_path, "power", name) == [0.1], "a value")  # noqa: B023
+    assert values(tmp_path, "power") == values(tmp_path, "power", "other.jsonl") == [0.1]
 
 
 def test_a_device_that_stops_answering_has_no_value(tmp_path: Path) -> None:

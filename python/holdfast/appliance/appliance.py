@@ -253,7 +253,8 @@ class _Running:
         with ExitStack() as closing:
             for part in parts:
                 closing.callback(part.close)
-            for part in reversed(parts):
+            # Forwards: devices offer no more values before the first output ends.
+            for part in self._parts:
                 part.stop()
 
     def reload(self, config: Config) -> list[str]:

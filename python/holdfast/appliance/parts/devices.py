@@ -120,7 +120,9 @@ class Devices(Part):
         return adopt
 
     def stop(self) -> None:
-        """Refuses writes of outputs from now on."""
+        """Offers outputs no more values, and refuses their writes."""
+        if self.values is not None:
+            self.values.stop()
         if self.writes is not None:
             self.writes.stop()
 

@@ -128,9 +128,14 @@ class TagValues:
         if self._thread.ident is None:
             self._thread.start()
 
+    def stop(self) -> None:
+        """Offers nothing from now on: outputs end one by one, and all get the same values."""
+        with self._lock:
+            self._ending.set()
+
     def join(self, timeout: float) -> None:
-        """Waits for the thread, which ends with the poller and does not rest any more."""
-        self._ending.set()
+        """Waits for the thread, which ends with the poller."""
+        self.stop()
         if self._thread.ident is not None:
             self._thread.join(timeout)
 
@@ -248,12 +253,12 @@ class TagValues:
                 log_lines.limited(logging.WARNING, "tag_polls_dropped", kind="", count=lost)
 
     def _handle(self, found: deque[Poll]) -> None:
-        # At the stop, the outputs have ended before.
         while found and not self._ending.is_set():
             self._heartbeat.beat()
             try:
                 with self._lock:
-                    self._offer(list(self._turn(found, time.monotonic() + _TURN_S)))
+                    if not self._ending.is_set():
+                        self._offer(list(self._turn(found, time.monotonic() + _TURN_S)))
             except Exception:  # A fault in one poll must not end all outputs.
                 log_lines.problem("tag_values_failed")
             if found:
