@@ -719,6 +719,9 @@ class HttpExchange:
     def end(self, is_complete: bool) -> None:
         """Ends a stream. One that is not complete is cut off."""
 
+    def watch_client(self) -> None:
+        """From now on, a client that has half-closed its connection is gone, as after `begin`."""
+
     def abandon(self) -> None:
         """Ends the connection: there will be no response."""
 
@@ -1431,7 +1434,8 @@ class Caller:
     def withdraw(self, ticket: int) -> bool:
         """Gives a call up: it is not sent if its turn has not come.
 
-        Returns whether its turn has come, so that the device may have received the request.
+        Returns whether its turn has come, so that the device may have received the request. Such a
+        call still has a result.
         """
 
 @final
@@ -1447,6 +1451,12 @@ class Passage:
         Blocks until the device has answered, or did not in time. Returns 0, or the exception code:
         of the device, 10 if it can't be reached, 11 if it does not answer. Raises `ValueError` for
         more values than a request can have.
+        """
+
+    def call(self, caller: Caller, area: Area, address: int, values: list[int]) -> int:
+        """Writes as `write`, without blocking. Returns the ticket.
+
+        The result is `ConnectionLost` for a write that was not sent, as while 256 wait.
         """
 
 @final

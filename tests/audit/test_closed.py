@@ -269,17 +269,17 @@ def test_writes_that_begin_together_are_recorded_before_the_first_is_carried_out
     begun = [rest.begin(json.dumps(each).encode(), GRANT, "127.0.0.1:9") for each in commands]
     assert (writes(log), any(contents(appliance))) == ([], False)
     if has_room:
-        begun[0]()
+        rest.finish(begun[0])
         assert [line["address"] for line in writes(log)] == [1, 2]
         assert contents(appliance)[1:3] == [500, 0]
-        begun[1]()
+        rest.finish(begun[1])
         assert len(writes(log)) == 2
         assert contents(appliance)[1:3] == [500, 500]
         return
     full(monkeypatch, room=200)
-    for finish in begun:
+    for each in begun:
         with pytest.raises(Refused) as caught:
-            finish()
+            rest.finish(each)
         assert caught.value.reason == "unrecorded"
     assert not any(contents(appliance))
 

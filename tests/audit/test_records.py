@@ -190,10 +190,10 @@ def test_a_write_of_values_that_become_stale_after_its_check_is_recorded_as_refu
     memory_access = MemoryAccess("rest", {"plant": memory}, audit)
     grant = Grant("gateway", ("plant",), ("holding_registers",))
     command = {"memory": "plant", "area": "holding_registers", "address": 3, "values": [7]}
-    finish = memory_access.begin(json.dumps(command).encode(), grant, "127.0.0.1:9")
+    begun = memory_access.begin(json.dumps(command).encode(), grant, "127.0.0.1:9")
     age.set(3600, refuses=True)
     with pytest.raises(Refused, match="too old"):
-        finish()
+        memory_access.finish(begun)
     assert [line["outcome"] for line in audited(tmp_path, 1)] == ["stale"]
     age.set(3600, refuses=False)
     memory_access.write([command], grant, "127.0.0.1:9")

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import json
 import resource
 import signal
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from queue import Queue
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
 import holdfast
+from holdfast.adapters.rest.device_writes import MAX_WAITING, DeviceWrites
+from holdfast.ingest import Grant, MemoryAccess
+from holdfast.net.http.requests import Request
 from support import web, wire
 from support.audits import writes
 from support.cli import RunCommand
@@ -344,6 +350,145 @@ def test_rest_writes_through_too_and_tells_the_exception(run: Run) -> None:
             refused = rest.ingest(web.command("holding_registers", 10, [3], "mirror"))
         assert (refused.status, refused.json["reason"]) == (502, "device_refused")
         assert "meter did not take the write: exception 04" in refused.json["detail"]
+
+
+class HeldWrites:
+    """A device that answers reads, and writes when the test lets it."""
+
+    def __init__(self) -> None:
+        self._writes: Queue[Asked] = Queue()
+
+    def __call__(self, asked: Asked) -> None:
+        if asked.pdu[0] > 4:
+            self._writes.put(asked)
+        else:
+            asked.answer()
+
+    def next(self) -> Asked:
+        """Waits for the next write."""
+        return self._writes.get(timeout=wire.DEADLINE)
+
+
+def posted(appliance: Appliance, value: int) -> wire.Connection:
+    """Sends a write of register 10 over REST, over a connection of its own."""
+    connection = wire.Connection(endpoint(appliance, "rest"))
+    body = json.dumps(web.command("holding_registers", 10, [value], "mirror")).encode()
+    connection.send(web.post(body, "Connection: close"))
+    return connection
+
+
+def answer(connection: wire.Connection) -> web.Answer:
+    (received,) = web.answers(connection.rest())
+    return received
+
+
+def of_rest(appliance: Appliance) -> Any:
+    return appliance.diagnostics.stats()["adapters"]["rest"]
+
+
+def connections(appliance: Appliance) -> Any:
+    return of_rest(appliance)["connections"]["open"]
+
+
+@pytest.mark.parametrize("leave", [wire.Connection.close, wire.Connection.finish])
+def test_a_write_of_rest_is_not_sent_once_its_client_has_gone(
+    run: Run, tmp_path: Path, leave: Callable[[wire.Connection], None]
+) -> None:
+    log, device_writes = tmp_path / "audit.jsonl", HeldWrites()
+    with plc(device_writes) as source:
+        meter = device(source.url, *READS, **RARELY)
+        appliance = run(configuration({"meter": meter}, **MORE, audit={"file": str(log)}))
+        until_read(appliance)
+        with posted(appliance, 1) as sent:
+            held = device_writes.next()
+            with posted(appliance, 2) as gone:
+                leave(gone)
+                wire.until(
+                    lambda: of_rest(appliance)["refused"] == {"withdrawn": 1}, "it is withdrawn"
+                )
+            held.answer()
+            assert answer(sent).status == 200
+        with posted(appliance, 3) as next_one:
+            device_writes.next().answer()
+            assert answer(next_one).status == 200
+        appliance.stop()
+        assert [pdu[-1] for pdu in writes_of(source)] == [1, 3]
+    assert [line["outcome"] for line in writes(log)] == ["withdrawn", "done", "done"]
+
+
+def test_the_end_of_rest_withdraws_what_was_not_sent(run: Run) -> None:
+    device_writes = HeldWrites()
+    with plc(device_writes) as source, ThreadPoolExecutor(1) as threads:
+        appliance = started(run, source)
+        with posted(appliance, 1) as sent:
+            held = device_writes.next()
+            with posted(appliance, 2) as waiting:
+                wire.until(lambda: connections(appliance) == 2, "both have arrived")
+                stopping = threads.submit(appliance.stop)
+                refused = answer(waiting)
+            held.answer()
+            assert answer(sent).status == 200
+        stopping.result(wire.DEADLINE)
+        assert (refused.status, refused.json["reason"]) == (503, "withdrawn")
+        assert [pdu[-1] for pdu in writes_of(source)] == [1]
+
+
+def test_a_silent_device_holds_up_no_other_write_of_rest(run: Run) -> None:
+    device_writes = HeldWrites()
+    with plc(device_writes) as source, contextlib.ExitStack() as stack:
+        appliance = started(run, source)
+        waiting = [stack.enter_context(posted(appliance, value)) for value in range(MAX_WAITING)]
+        held = device_writes.next()
+        rest = web.Client(endpoint(appliance, "rest"))
+        with contextlib.closing(rest):
+            for batch in (False, True):
+                command = web.command("holding_registers", 0, [7], "mirror")
+                assert rest.ingest([command] if batch else command).status == 200
+            wire.until(lambda: connections(appliance) == MAX_WAITING + 1, "all have arrived")
+            refused = rest.ingest(web.command("holding_registers", 10, [7], "mirror"))
+        assert (refused.status, refused.json["reason"]) == (503, "busy")
+        assert "16 writes wait for meter" in refused.json["detail"]
+        for _ in waiting[1:]:
+            held.answer()
+            held = device_writes.next()
+        held.answer()
+        assert {answer(each).status for each in waiting} == {200}
+
+
+def test_a_write_whose_answer_nobody_waited_for_is_recorded() -> None:
+    """The device answers later than REST ends."""
+
+    class Passage:
+        is_called = asyncio.Event()
+
+        def device_of(self, *_: object) -> str:
+            return "drive"
+
+        def call(self, *_: object) -> int:
+            self.is_called.set()
+            return 1  # The caller knows no such ticket: its turn has come.
+
+    class Sent(Request):
+        def when_gone(self, function: object) -> None:
+            pass
+
+    async def cancelled() -> None:
+        request = Sent("POST", "/", b"", [], "127.0.0.1:50000")
+        device_writes = DeviceWrites(memory_access)
+        carried_out = asyncio.create_task(device_writes.carry_out(request, begun))
+        await passage.is_called.wait()
+        device_writes.end()
+        carried_out.cancel()
+        await asyncio.gather(carried_out, return_exceptions=True)
+
+    plant, passage = holdfast.Memory(holding_registers=8), Passage()
+    plant.mirror([("holding_registers", 0, 8)])
+    memory_access = MemoryAccess("rest", {"plant": plant}, passages=cast("Any", {"plant": passage}))
+    grant = Grant("edge", ["plant"], ["holding_registers"])
+    body = json.dumps(web.command("holding_registers", 0, [7], "plant")).encode()
+    begun = memory_access.begin(body, grant, "127.0.0.1:50000")
+    asyncio.run(cancelled())
+    assert memory_access.counts()["refused"] == {"device_refused": 1}
 
 
 def test_a_write_that_memory_could_not_keep_is_not_confirmed(tmp_path: Path) -> None:

@@ -63,6 +63,10 @@ impl HttpExchange {
         self.core.end(is_complete);
     }
 
+    fn watch_client(&self) {
+        self.core.watch_client();
+    }
+
     /// Cuts off the connection, unless there has been a response.
     fn abandon(&self) {
         self.core.abandon();

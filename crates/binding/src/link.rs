@@ -192,33 +192,54 @@ impl Passage {
 
     /// Returns the code of the exception, 0 if the device has confirmed the write.
     fn write(&self, py: Python<'_>, area: &str, address: u16, values: Vec<u16>) -> PyResult<u8> {
-        let area = named(area)?;
-        let most = if area.is_bits() { limit::WRITE_BITS } else { limit::WRITE_REGISTERS };
-        within("number of values", values.len() as i128, 1..=most.into())?;
-        let items: Vec<bool> = values.iter().map(|value| *value != 0).collect();
-        let mut room = [0; pdu::MAX_LEN];
-        let fits = "there are no more values than a request has room for";
-        let request = match (area, &values[..]) {
-            (Area::Coils, [value]) => CoreRequest::WriteSingleCoil { address, value: *value != 0 },
-            (Area::Coils, _) => {
-                let bits = Bits::pack(&items, &mut room).expect(fits);
-                CoreRequest::WriteMultipleCoils { address, bits }
-            }
-            (Area::HoldingRegisters, [value]) => {
-                CoreRequest::WriteSingleRegister { address, value: *value }
-            }
-            (Area::HoldingRegisters, values) => {
-                let registers = Registers::pack(values, &mut room).expect(fits);
-                CoreRequest::WriteMultipleRegisters { address, registers }
-            }
-            _ => {
-                let name = area.name();
-                return Err(PyValueError::new_err(format!("devices have no writable {name}")));
-            }
-        };
-        let written = py.detach(|| self.core.write(&request));
-        Ok(written.err().unwrap_or(0))
+        with_write(area, address, &values, |request| {
+            py.detach(|| self.core.write(request)).err().unwrap_or(0)
+        })
     }
+
+    fn call(
+        &self,
+        caller: PyRef<'_, Caller>,
+        area: &str,
+        address: u16,
+        values: Vec<u16>,
+    ) -> PyResult<u64> {
+        with_write(area, address, &values, |request| self.core.call(&caller.core, request))
+    }
+}
+
+/// Hands over the request that writes values.
+fn with_write<T>(
+    area: &str,
+    address: u16,
+    values: &[u16],
+    then: impl FnOnce(&CoreRequest<'_>) -> T,
+) -> PyResult<T> {
+    let area = named(area)?;
+    let most = if area.is_bits() { limit::WRITE_BITS } else { limit::WRITE_REGISTERS };
+    within("number of values", values.len() as i128, 1..=most.into())?;
+    let items: Vec<bool> = values.iter().map(|value| *value != 0).collect();
+    let mut room = [0; pdu::MAX_LEN];
+    let fits = "there are no more values than a request has room for";
+    let request = match (area, values) {
+        (Area::Coils, [value]) => CoreRequest::WriteSingleCoil { address, value: *value != 0 },
+        (Area::Coils, _) => {
+            let bits = Bits::pack(&items, &mut room).expect(fits);
+            CoreRequest::WriteMultipleCoils { address, bits }
+        }
+        (Area::HoldingRegisters, [value]) => {
+            CoreRequest::WriteSingleRegister { address, value: *value }
+        }
+        (Area::HoldingRegisters, values) => {
+            let registers = Registers::pack(values, &mut room).expect(fits);
+            CoreRequest::WriteMultipleRegisters { address, registers }
+        }
+        _ => {
+            let name = area.name();
+            return Err(PyValueError::new_err(format!("devices have no writable {name}")));
+        }
+    };
+    Ok(then(&request))
 }
 
 /// The ranges of a memory whose writes go to devices.

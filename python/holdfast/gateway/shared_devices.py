@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 import time
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from holdfast._core import Caller
 from holdfast.client.endpoint import endpoint
 from holdfast.errors import ConnectionLost, InvalidResponse, ModbusError, ModbusException
 from holdfast.gateway.broadcast import is_broadcast
+from holdfast.polling.calls import Calls
 
 if TYPE_CHECKING:
     from holdfast._core import Endpoint, Link, Poller, Request
@@ -43,7 +42,7 @@ class Shared:
         """Links, and when they were used. While one is held, its connection stays open."""
         self._endpoints: dict[NetworkTarget, tuple[Endpoint, float]] = {}
         """Endpoints with TLS, and when their files were read."""
-        self._calls: _Calls | None = None
+        self._calls: Calls | None = None
         self._opening = asyncio.Lock()
 
     async def turns(self, target: NetworkTarget, timeout: float) -> Turns | None:
@@ -61,7 +60,7 @@ class Shared:
             return None
         if self._calls is None:
             async with self._opening:
-                self._calls = self._calls or await _Calls.opened()
+                self._calls = self._calls or await Calls.opened()
         return _LinkTurns(target, self._calls, link, timeout)
 
     def knows(self, target: NetworkTarget) -> bool:
@@ -129,7 +128,7 @@ class Turns:
 class _LinkTurns(Turns):
     """Turns on a link of the appliance, within `timeout` seconds from now."""
 
-    def __init__(self, target: NetworkTarget, calls: _Calls, link: Link, timeout: float) -> None:
+    def __init__(self, target: NetworkTarget, calls: Calls, link: Link, timeout: float) -> None:
         super().__init__(target)
         self._calls = calls
         self._link = link
@@ -154,45 +153,3 @@ class _LinkTurns(Turns):
         if isinstance(result, ModbusException) and broadcast:
             raise InvalidResponse(f"the peer answered a broadcast with {result}")
         raise result
-
-
-class _Calls(asyncio.Protocol):
-    """The calls of an event loop. Receives a byte when results are ready."""
-
-    def __init__(self, caller: Caller) -> None:
-        self.caller = caller
-        self._loop = asyncio.get_running_loop()
-        self._futures: dict[int, asyncio.Future[tuple[bool, Any]]] = {}
-        self._transport: asyncio.BaseTransport | None = None
-
-    @staticmethod
-    async def opened() -> _Calls:
-        """Returns the calls of the running event loop. Raises `OSError` without a free socket."""
-        caller = Caller()
-        calls = _Calls(caller)
-        wakes = socket.socket(fileno=caller.detach())
-        await calls._loop.create_connection(lambda: calls, sock=wakes)
-        return calls
-
-    async def result(self, ticket: int) -> tuple[bool, Any]:
-        """Waits for the end of a call: whether it was sent, and a result or a `ModbusError`."""
-        future: asyncio.Future[tuple[bool, Any]] = self._loop.create_future()
-        self._futures[ticket] = future
-        try:
-            return await future
-        finally:
-            del self._futures[ticket]
-
-    def close(self) -> None:
-        """Ends the wake-ups."""
-        if self._transport is not None:
-            self._transport.close()
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        self._transport = transport
-
-    def data_received(self, _data: bytes) -> None:
-        for ticket, sent, result in self.caller.take():
-            future = self._futures.get(ticket)
-            if future is not None and not future.done():
-                future.set_result((sent, result))

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from holdfast._core import Follower
 from holdfast.ingest.counts import Counts
-from holdfast.ingest.memory_access import Grant, MemoryAccess, Written
+from holdfast.ingest.memory_access import Begun, Grant, MemoryAccess, Written
 from holdfast.ingest.refusals import KEEPING, Refused, unreadable
 
 __all__ = [
     "KEEPING",
+    "Begun",
     "Counts",
     "Follower",
     "Grant",

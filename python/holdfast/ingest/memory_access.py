@@ -7,6 +7,7 @@ Accesses are counted, and writes are audited.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from dataclasses import dataclass
@@ -37,7 +38,7 @@ from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from holdfast._core import Follower, Memory, Passage
     from holdfast.events.audit import Audit
@@ -87,6 +88,7 @@ class Begun:
     single: bool
     """Whether the batch is one command, sent alone."""
     grant: Grant
+    peer: str
     stale: str | None = None
     """Why the commands may be old; `None` if nothing says so."""
     writes: _core.Batch | None = None
@@ -98,6 +100,12 @@ class Begun:
     def command(self) -> Mapping[str, Any] | None:
         """The only command; `None` for a batch."""
         return self.batch[0] if self.single else None
+
+    @property
+    def where(self) -> dict[str, Any]:
+        """The target of the only command."""
+        [command] = self.batch
+        return place_of(None, command["memory"], command["area"], command["address"])
 
 
 class MemoryAccess:
@@ -118,11 +126,6 @@ class MemoryAccess:
         self._counts = Counts()
         self._lock = threading.Lock()
 
-    @property
-    def may_wait(self) -> bool:
-        """Whether a write can take as long as a device, a disk or a log needs to answer."""
-        return bool(self._passages) or any(memory.waits for memory in self.memories.values())
-
     def ingest(
         self,
         body: bytes | bytearray | memoryview,
@@ -135,14 +138,14 @@ class MemoryAccess:
 
         `stale` says why the commands may be old: memory takes them, but no device does.
         """
-        return self.begin(body, grant, peer, stale=stale)()
+        return self.finish(self.begin(body, grant, peer, stale=stale))
 
     def write(self, commands: Sequence[Mapping[str, object]], grant: Grant, peer: str) -> Written:
         """Carries out commands atomically, each with memory, area, address and values.
 
         Raises `Refused`.
         """
-        return self._begin(lambda: list(commands), grant, peer)()
+        return self.finish(self._begin(lambda: list(commands), grant, peer))
 
     def begin(
         self,
@@ -151,12 +154,51 @@ class MemoryAccess:
         peer: str,
         *,
         stale: str | None = None,
-    ) -> Callable[[], Written]:
-        """Checks JSON as `ingest`, and returns what carries it out. Both raise `Refused`.
+    ) -> Begun:
+        """Checks JSON as `ingest`, for `finish`. Raises `Refused`.
 
         Writes that begin before others are carried out get into the audit log together.
         """
         return self._begin(partial(_decoded, body), grant, peer, stale)
+
+    def finish(self, begun: Begun) -> Written:
+        """Carries out what has begun, and waits for a device, a disk or a log. Raises `Refused`."""
+        with self.refusing(begun):
+            if begun.device is None:
+                values = self._stored(begun)
+            if begun.device is None:
+                return self._accepted(begun, values)
+            code = self._to_device(begun, lambda passage, *write: passage.write(*write))
+            return self.answered(begun, code)
+
+    def waits(self, begun: Begun) -> bool:
+        """Whether a write to memory can take as long as a disk or a log needs to answer."""
+        return any(self.memories[command["memory"]].waits for command in begun.batch)
+
+    @contextlib.contextmanager
+    def refusing(self, begun: Begun) -> Iterator[None]:
+        """Counts, logs and audits a `Refused` of what has begun."""
+        try:
+            yield
+        except Refused as refused:
+            self.refuse(refused, begun.grant.name, begun.peer)
+            raise
+
+    def call_device(self, begun: Begun, caller: _core.Caller) -> int:
+        """Sends a write for a device on its way. Returns the ticket. Raises `Refused`."""
+        return self._to_device(begun, lambda passage, *write: passage.call(caller, *write))
+
+    def answered(self, begun: Begun, code: int) -> Written:
+        """Takes the answer of the device: 0, or the code of an exception. Raises `Refused`."""
+        if code == 0:
+            if begun.recording is not None:
+                begun.recording.done()
+            return self._accepted(begun, len(values_of(begun.batch[0])))
+        name = EXCEPTIONS.get(code, "unknown")
+        detail = f"{begun.device} did not take the write: exception {code:02X} ({name})"
+        if code not in NOT_EXECUTED:
+            detail += "; it may still be carried out, or have been"
+        raise Refused("device_refused", detail, **begun.where)
 
     def commands(self, grant: Grant, most: int) -> _core.Commands:
         """Parses commands of at most `most` bytes, for `begin_parsed`.
@@ -281,13 +323,12 @@ class MemoryAccess:
 
     def _begin(
         self, read: Callable[[], object], grant: Grant, peer: str, stale: str | None = None
-    ) -> Callable[[], Written]:
+    ) -> Begun:
         try:
-            begun = self._begun(read(), grant, peer, stale)
+            return self._begun(read(), grant, peer, stale)
         except Refused as refused:
             self.refuse(refused, grant.name, peer)
             raise
-        return partial(self._finish, begun, peer)
 
     def _finish_parsed(self, writes: _core.ParsedWrites, group: Group | None) -> list[Written]:
         try:
@@ -305,19 +346,12 @@ class MemoryAccess:
         before, after = origin_around(self.name, grant.name)
         return before + encoded(peer) + after
 
-    def _finish(self, begun: Begun, peer: str) -> Written:
-        try:
-            return self._finished(begun)
-        except Refused as refused:
-            self.refuse(refused, begun.grant.name, peer)
-            raise
-
     def _begun(self, document: object, grant: Grant, peer: str, stale: str | None) -> Begun:
         single = not isinstance(document, list)
         batch: Any = [document] if single else document
         if not batch:
             raise Refused("malformed", "the batch is empty")
-        begun = Begun(batch, single, grant, stale)
+        begun = Begun(batch, single, grant, peer, stale)
         try:
             # Commands are checked one by one: native code stops at the first refused command.
             begun.writes = _core.Batch(
@@ -336,11 +370,7 @@ class MemoryAccess:
             begun.device = self._device(begun, refused)
         return begun
 
-    def _finished(self, begun: Begun) -> Written:
-        if begun.device is None:
-            values = self._stored(begun)
-        if begun.device is not None:
-            values = self._pass(begun)
+    def _accepted(self, begun: Begun, values: int) -> Written:
         with self._lock:
             self._counts.accepted += 1
             self._counts.values += values
@@ -386,31 +416,21 @@ class MemoryAccess:
             error.is_recorded = True
         raise error from None
 
-    def _pass(self, begun: Begun) -> int:
-        """Writes to a device. Returns the number of values. Raises `Refused`."""
+    def _to_device(self, begun: Begun, write: Callable[..., int]) -> int:
+        """Calls `write` with the passage, area, address and values. Raises `Refused`."""
         [command] = begun.batch
-        memory, area, address = command["memory"], command["area"], command["address"]
-        where = place_of(None, memory, area, address)
         values = [int(value) for value in values_of(command)]
         if self._audit is not None:
             try:
                 self._audit.require()
             except Unrecorded:
                 raise unrecorded(begun.command) from None
+        passage = self._passages[command["memory"]]
         try:
-            code = self._passages[memory].write(area, address, values)
+            return write(passage, command["area"], command["address"], values)
         except ValueError as error:
             detail = f"{error}, in one write to {begun.device}"
-            raise Refused("out_of_range", detail, **where) from None
-        if code == 0:
-            if begun.recording is not None:
-                begun.recording.done()
-            return len(values)
-        name = EXCEPTIONS.get(code, "unknown")
-        detail = f"{begun.device} did not take the write: exception {code:02X} ({name})"
-        if code not in NOT_EXECUTED:
-            detail += "; it may still be carried out, or have been"
-        raise Refused("device_refused", detail, **where)
+            raise Refused("out_of_range", detail, **begun.where) from None
 
     def _checked(self, command: object, grant: Grant, index: int | None) -> Write:
         """Checks a command, except its range and its values, which native code checks."""

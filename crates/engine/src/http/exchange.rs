@@ -141,6 +141,13 @@ impl Exchange {
         }
     }
 
+    /// From now on, a client that sends no more counts as gone: a full close looks the same.
+    pub fn watch_client(&self) {
+        let mut state = lock(&self.state);
+        state.leaves = true;
+        wake(state);
+    }
+
     /// Answers the request with a stream. From now on, a client that sends no more counts as gone: a
     /// stream may have no other end.
     pub fn begin(&self, head: ResponseHead) {

@@ -55,11 +55,12 @@ pub struct Called {
 
 /// A call that has not ended. It ends as lost when this is dropped.
 #[derive(Debug)]
-pub(super) struct Waiting {
+pub(crate) struct Waiting {
     caller: Arc<Caller>,
     ticket: u64,
     timeout: Duration,
-    until: Instant,
+    /// `None` for a timeout that never ends.
+    until: Option<Instant>,
     is_broadcast: bool,
     has_ended: bool,
 }
@@ -76,7 +77,7 @@ impl Caller {
     }
 
     /// A new call. Nothing ends it at its timeout if its turn has not come: its caller must withdraw it.
-    pub(super) fn begin(
+    pub(crate) fn begin(
         self: &Arc<Caller>,
         request: &EncodedRequest,
         timeout: Duration,
@@ -87,14 +88,19 @@ impl Caller {
         state.next += 1;
         state.pending.insert(ticket, Pending { request: request.clone(), is_sent: false });
         drop(state);
-        let (caller, until) = (Arc::clone(self), Instant::now() + timeout);
+        let (caller, until) = (Arc::clone(self), Instant::now().checked_add(timeout));
         (ticket, Waiting { caller, ticket, timeout, until, is_broadcast, has_ended: false })
     }
 
-    /// Gives a call up: it is not sent if its turn has not come. Returns whether its turn has come.
+    /// Gives a call up: it is not sent if its turn has not come. Returns whether its turn has come; such a
+    /// call still has a result.
     pub fn withdraw(&self, ticket: u64) -> bool {
-        let pending = lock(&self.state).pending.remove(&ticket);
-        pending.is_none_or(|pending| pending.is_sent)
+        let mut state = lock(&self.state);
+        let is_sent = state.pending.get(&ticket).is_none_or(|pending| pending.is_sent);
+        if !is_sent {
+            state.pending.remove(&ticket);
+        }
+        is_sent
     }
 
     /// Takes all calls that have ended.
@@ -123,21 +129,21 @@ impl Waiting {
 
     /// The time that is left.
     pub(super) fn left(&self) -> Duration {
-        self.until.saturating_duration_since(Instant::now())
+        self.until.map_or(Duration::MAX, |until| until.saturating_duration_since(Instant::now()))
     }
 
     pub(super) fn is_unwanted(&self) -> bool {
         self.left().is_zero() || !lock(&self.caller.state).pending.contains_key(&self.ticket)
     }
 
-    /// Its turn has come.
-    pub(super) fn note_sent(&self) {
-        if let Some(pending) = lock(&self.caller.state).pending.get_mut(&self.ticket) {
-            pending.is_sent = true;
-        }
+    /// Its turn has come. Returns whether it has not been given up.
+    pub(crate) fn note_sent(&self) -> bool {
+        let mut state = lock(&self.caller.state);
+        let pending = state.pending.get_mut(&self.ticket);
+        pending.map(|pending| pending.is_sent = true).is_some()
     }
 
-    pub(super) fn end(mut self, outcome: Result<Vec<u8>, Arc<ClientError>>) {
+    pub(crate) fn end(mut self, outcome: Result<Vec<u8>, Arc<ClientError>>) {
         self.has_ended = true;
         let is_over = matches!(&outcome, Err(error) if matches!(**error, ClientError::Timeout(_)));
         let outcome = if self.is_broadcast && is_over { Ok(Vec::new()) } else { outcome };
@@ -205,6 +211,20 @@ mod tests {
         waiting.end(Ok(vec![3, 2, 0, 7]));
         assert!(caller.take().is_empty());
         assert_eq!(woken(&wakes), 0);
+    }
+
+    #[test]
+    fn a_call_whose_turn_has_come_has_a_result_although_it_was_given_up() {
+        let (caller, _wakes) = Caller::new().unwrap();
+        let (ticket, waiting) = caller.begin(&read(), Duration::MAX, false);
+        assert!(waiting.note_sent());
+        assert!(caller.withdraw(ticket), "its turn has come");
+        waiting.end(Ok(vec![3, 2, 0, 7]));
+        assert_eq!(caller.take().len(), 1);
+
+        let (ticket, waiting) = caller.begin(&read(), Duration::MAX, false);
+        assert!(!caller.withdraw(ticket));
+        assert!(!waiting.note_sent(), "it is not sent");
     }
 
     #[test]

@@ -17,6 +17,7 @@ pub(crate) mod scheduling;
 pub(crate) mod sockets;
 
 pub(crate) use access::Link;
+pub(crate) use caller::Waiting;
 pub use caller::{Called, Caller};
 pub use fault::Fault;
 pub(crate) use fault::{confirmation, exception, exception_in};

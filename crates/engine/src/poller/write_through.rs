@@ -12,10 +12,11 @@ use holdfast_memory::{Access, Area, Memory, Outcome, Refusal, Write};
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, Function, Range, Request};
 use tokio::sync::{mpsc, oneshot};
 
+use crate::client::ClientError;
 use crate::items::{Items, touched};
 use crate::link::{
-    Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, confirmation, exception,
-    exception_in, pending_reply, submit_under,
+    Caller, Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, confirmation,
+    exception, exception_in, pending_reply, submit_under,
 };
 
 /// The most writes into one memory that wait for devices.
@@ -52,8 +53,34 @@ pub(super) struct PassedWrite {
     pdu: Vec<u8>,
     /// As the device gets it.
     request: EncodedRequest,
-    reply: ReplyTo,
+    reply: Receiver,
     _place: Place,
+}
+
+/// Who gets the answer.
+enum Receiver {
+    Client(ReplyTo),
+    EventLoop(Waiting),
+}
+
+impl Receiver {
+    /// The turn of the write has come. Returns whether it is still wanted.
+    fn is_next(&self) -> bool {
+        match self {
+            Receiver::Client(to) => !to.is_unwanted(),
+            Receiver::EventLoop(to) => to.note_sent(),
+        }
+    }
+
+    fn send(self, pdu: Vec<u8>) {
+        match self {
+            Receiver::Client(to) => to.send(pdu),
+            Receiver::EventLoop(to) => to.end(match exception_in(&pdu) {
+                Some(code) => Err(Arc::new(ClientError::Exception(code))),
+                None => Ok(pdu),
+            }),
+        }
+    }
 }
 
 /// Values that a device has accepted or returned, in its own addresses.
@@ -110,7 +137,9 @@ impl Passage {
         if self.memory.sealed() {
             return Err(ExceptionCode::ServerDeviceBusy);
         }
-        self.pass(pdu)
+        let (reply, pending) = pending_reply();
+        let device = self.pass(pdu, Receiver::Client(reply))?;
+        Ok((device, pending))
     }
 
     /// The device that a range of the memory is read from, if one write can change it.
@@ -126,14 +155,24 @@ impl Passage {
     /// The code of the exception: of the device, or as for clients.
     pub fn write(&self, request: &Request<'_>) -> Result<(), u8> {
         let encoded = EncodedRequest::new(request);
-        let (_, pending) = self.pass(encoded.pdu()).map_err(ExceptionCode::code)?;
+        let (reply, pending) = pending_reply();
+        self.pass(encoded.pdu(), Receiver::Client(reply)).map_err(ExceptionCode::code)?;
         match pending.wait() {
             Ok(reply) => exception_in(&reply.pdu).map_or(Ok(()), Err),
             Err(_) => Err(ExceptionCode::GatewayPathUnavailable.code()),
         }
     }
 
-    fn pass(&self, pdu: &[u8]) -> Result<(Arc<str>, PendingReply), ExceptionCode> {
+    /// Sends a write of an event loop on its way, which can withdraw it. Returns the ticket.
+    pub fn call(&self, caller: &Arc<Caller>, request: &Request<'_>) -> u64 {
+        let encoded = EncodedRequest::new(request);
+        let (ticket, waiting) = caller.begin(&encoded, Duration::MAX, false);
+        // What is refused here ends as lost, and was not sent.
+        let _ = self.pass(encoded.pdu(), Receiver::EventLoop(waiting));
+        ticket
+    }
+
+    fn pass(&self, pdu: &[u8], reply: Receiver) -> Result<Arc<str>, ExceptionCode> {
         let request = Request::parse(pdu)?;
         let (read, written) = touched(&request);
         let written = written.ok_or(ExceptionCode::IllegalFunction)?;
@@ -146,7 +185,6 @@ impl Passage {
         if self.waiting.fetch_add(1, Ordering::Relaxed) >= MAX_WAITING {
             return Err(ExceptionCode::GatewayPathUnavailable);
         }
-        let (reply, pending) = pending_reply();
         let passed = PassedWrite {
             memory: Arc::clone(&self.memory),
             range: range.clone(),
@@ -157,7 +195,7 @@ impl Passage {
         };
         let sent = self.writes.send(passed);
         sent.or(Err(ExceptionCode::GatewayPathUnavailable))?;
-        Ok((Arc::clone(&range.device), pending))
+        Ok(Arc::clone(&range.device))
     }
 }
 
@@ -200,7 +238,7 @@ impl PassedWrite {
         timeout: Duration,
         permit: &Permit,
     ) -> Vec<Change> {
-        if self.reply.is_unwanted() {
+        if !self.reply.is_next() {
             return Vec::new();
         }
         if link.retry_at().is_some() {

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import msgspec
 
 from holdfast.adapters.rest.changes import MAX_VALUES, ChangeStreams
+from holdfast.adapters.rest.device_writes import DeviceWrites
 from holdfast.adapters.rest.grants import ANYONE, Grants
 from holdfast.adapters.rest.refusals import REFUSALS
 from holdfast.adapters.sessions import parse_session_id
@@ -32,7 +33,7 @@ from holdfast.net.http.requests import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Awaitable, Callable, Iterable, Mapping
 
     from holdfast._core import Commands, ParsedWrites
     from holdfast.adapters.diagnostics import DiagnosticsSource
@@ -83,6 +84,7 @@ class App(Application):
         self._sessions = sessions
         self._parsing: dict[str, tuple[Commands, Callable[[ParsedWrites], object]]] = {}
         self._streams = ChangeStreams(settings.max_connections)
+        self._device_writes = DeviceWrites(memory_access)
 
     @property
     def open_streams(self) -> int:
@@ -90,8 +92,9 @@ class App(Application):
         return self._streams.open
 
     def end(self) -> None:
-        """Ends all streams. Thread-safe."""
+        """Ends all streams, and withdraws the writes that wait for devices. Thread-safe."""
         self.call_soon(self._streams.end)
+        self.call_soon(self._device_writes.end)
 
     def refused(self, request: Request, error: Exception) -> Response:
         """Returns the refusal, and counts it unless the memory access has."""
@@ -112,9 +115,12 @@ class App(Application):
         if COMMANDS not in request.kept:
             # From now on, the core parses what comes with this head.
             request.kept[COMMANDS] = self._parser(grant)
-        if access.may_wait:
-            return _written(partial(access.ingest, body, grant, request.peer))
-        finish = access.begin(body, grant, request.peer)
+        begun = access.begin(body, grant, request.peer)
+        if begun.device is not None:
+            return _written(self._device_writes.carry_out(request, begun))
+        finish = partial(access.finish, begun)
+        if access.waits(begun):
+            return _written(asyncio.to_thread(finish))
         return lambda: response(JSON, _answer(finish()))
 
     def _parser(self, grant: Grant) -> tuple[Commands, Callable[[ParsedWrites], object]]:
@@ -194,9 +200,8 @@ class App(Application):
         return json_response({"status": "ended", "id": request_body.id})
 
 
-async def _written(ingest: Callable[[], Written]) -> Response:
-    """Writes in a thread of its own, because the write can wait."""
-    return response(JSON, _answer(await asyncio.to_thread(ingest)))
+async def _written(written: Awaitable[Written]) -> Response:
+    return response(JSON, _answer(await written))
 
 
 @lru_cache(MAX_ANSWERS)

@@ -40,10 +40,11 @@ REFUSALS = Refusals(
     ),
     Refusal(
         503,
-        ("unrecorded", "not_stored", "log_unavailable", "stale", "busy"),
+        ("unrecorded", "not_stored", "log_unavailable", "stale", "busy", "withdrawn"),
         "The audit log, the file or the log of the memory can't be written, and nothing has "
-        "changed; the range mirrors a device whose values are too old; or too many change streams "
-        "are open",
+        "changed; the range mirrors a device whose values are too old; too many change streams "
+        "are open, or too many writes wait for a device; or a write was not sent to its device, "
+        "because its client has gone or the service ends",
         "the audit log can't be written, and no write is carried out without a record",
     ),
     Refusal(
@@ -67,6 +68,8 @@ VALUES = (
     "invalid_value",
     "mirrored",
     "device_refused",
+    "busy",
+    "withdrawn",
     "unrecorded",
     "not_one_step",
     "not_stored",

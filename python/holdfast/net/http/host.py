@@ -432,8 +432,10 @@ class _HostRequest(Request):
     def when_gone(self, function: Callable[[], object] | None) -> None:
         """Calls a function when the client is gone, or at once if it is; `None`: no more."""
         self._when_gone = function
-        if self._is_gone and function is not None:
-            function()
+        if function is not None:
+            self.exchange.watch_client()
+            if self._is_gone:
+                function()
 
     async def begin(self, status: int, headers: Headers) -> None:
         """Begins a stream."""

@@ -140,7 +140,8 @@ class Request:
     def when_gone(self, function: Callable[[], object] | None) -> None:
         """Calls a function when the client is gone, or at once if it is; `None`: no more.
 
-        The body must have been read.
+        The body must have been read. From here on, a half-close of the client means that it is
+        gone.
         """
         raise NotImplementedError
 

@@ -1,0 +1,102 @@
+"""Writes that go to devices in place of a memory: each waits for its turn and for the answer.
+
+A write whose turn has not come is withdrawn when its client has gone, and when the server ends. One
+that was sent is waited for, and recorded with the answer of the device.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from functools import partial
+from typing import TYPE_CHECKING
+
+from holdfast.errors import ModbusError, ModbusException
+from holdfast.ingest import Refused
+from holdfast.polling.calls import Calls
+from holdfast.protocol import PATH_UNAVAILABLE, TARGET_SILENT
+
+if TYPE_CHECKING:
+    from holdfast.ingest import Begun, MemoryAccess, Written
+    from holdfast.net.http.requests import Request
+
+MAX_WAITING = 16
+"""The most writes that wait for one device: a silent one must not occupy all connections."""
+
+
+class DeviceWrites:
+    """The writes of one server that wait for devices."""
+
+    def __init__(self, memory_access: MemoryAccess) -> None:
+        self._memory_access = memory_access
+        self._calls: Calls | None = None
+        self._opening = asyncio.Lock()
+        self._waiting: Counter[str] = Counter()
+        self._tickets: set[int] = set()
+        self._is_ending = False
+
+    def end(self) -> None:
+        """Withdraws all writes whose turn has not come. Called in the thread of the server."""
+        self._is_ending = True
+        if self._calls is not None:
+            for ticket in self._tickets:
+                self._calls.withdraw(ticket)
+        self._close_after_last()
+
+    async def carry_out(self, request: Request, begun: Begun) -> Written:
+        """Carries out a write that goes to a device. Raises `Refused`."""
+        device = begun.device
+        assert device is not None
+        with self._memory_access.refusing(begun):
+            if self._waiting[device] >= MAX_WAITING:
+                detail = f"{MAX_WAITING} writes wait for {device}, which is the limit"
+                raise Refused("busy", detail, **begun.where)
+            if self._is_ending:
+                raise _withdrawn(begun)
+            self._waiting[device] += 1
+            try:
+                return self._memory_access.answered(begun, await self._answer(request, begun))
+            finally:
+                self._waiting[device] -= 1
+                self._close_after_last()
+
+    async def _answer(self, request: Request, begun: Begun) -> int:
+        """Returns the answer of the device: 0, or the code of an exception. Raises `Refused`."""
+        if self._calls is None:
+            async with self._opening:
+                self._calls = self._calls or await Calls.opened()
+        calls = self._calls
+        ticket = self._memory_access.call_device(begun, calls.caller)
+        answer = calls.result(ticket)
+        self._tickets.add(ticket)
+        request.when_gone(partial(calls.withdraw, ticket))
+        try:
+            sent, result = await answer
+        except asyncio.CancelledError:
+            # Nobody waits for the answer any more: the record of the write must say so.
+            refused = _withdrawn(begun)
+            if calls.caller.withdraw(ticket):
+                detail = f"REST has ended before the answer of {begun.device}"
+                detail += "; the write may still be carried out, or have been"
+                refused = Refused("device_refused", detail, **begun.where)
+            self._memory_access.refuse(refused, begun.grant.name, begun.peer)
+            raise
+        finally:
+            request.when_gone(None)
+            self._tickets.discard(ticket)
+        if not sent and result is None:
+            raise _withdrawn(begun)
+        if isinstance(result, ModbusException):
+            return result.code
+        if isinstance(result, ModbusError):
+            return TARGET_SILENT if sent else PATH_UNAVAILABLE
+        return 0
+
+    def _close_after_last(self) -> None:
+        if self._is_ending and self._calls is not None and not any(self._waiting.values()):
+            self._calls.close()
+
+
+def _withdrawn(begun: Begun) -> Refused:
+    detail = f"not sent to {begun.device}: the client has gone, or REST has ended"
+    return Refused("withdrawn", detail, **begun.where)
