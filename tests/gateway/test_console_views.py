@@ -152,6 +152,18 @@ def test_a_file_is_added(opened: Opened, tmp_path: Path) -> None:
 # Writing.
 
 
+def test_the_sign_of_zero_is_written(opened: Opened, plant: holdfast.Memory) -> None:
+    view = connected(opened)
+    view.read_four(8, type="float32")
+    review = view.page.get_by_role("textbox", name="New value")
+    view.button("Write 8").click()
+    review.fill("-0")
+    view.button("Review").click()
+    view.button("Write it").click()
+    view.says("Written and read back")
+    assert plant.read("holding_registers", 8, 2) == [0x8000, 0]
+
+
 def test_a_tag_is_written_in_its_unit(opened: Opened, plant: holdfast.Memory) -> None:
     view = connected(opened)
     add_tags(view, METER)

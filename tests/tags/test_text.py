@@ -187,6 +187,12 @@ def test_no_value_is_no_text() -> None:
     assert [text_of(tag("float32"), none) for none in (None, math.nan)] == ["", ""]
 
 
+@pytest.mark.parametrize("text", ["-0", "-0.0"])
+def test_the_sign_of_a_zero_that_is_typed_is_kept(text: str) -> None:
+    assert math.copysign(1, value_from(tag("float32"), text)) == -1
+    assert tag("int16").raw(value_from(tag("int16"), text)) == 0
+
+
 def test_the_sign_of_zero_is_kept() -> None:
     assert text_of(tag("float32"), -0.0) == "-0"
     assert repr(plain(tag("float32"), -0.0)) == "-0.0"

@@ -95,7 +95,9 @@ def value_from(tag: Tag, text: str, *, states: bool = True) -> Any:
             return _switched(word, names)
         return from_text(text, tag.of_type, tag.type)
     if _INTEGER.fullmatch(word):
-        return int(word)
+        # An integer has no sign of zero.
+        is_minus_zero = tag.is_float and word[0] == "-" and int(word) == 0
+        return -0.0 if is_minus_zero else int(word)
     if _HEX.fullmatch(word) and not tag.is_float and (tag.scale, tag.offset) == (1, 0):
         return int(word, 16)
     if _DECIMAL.fullmatch(word):

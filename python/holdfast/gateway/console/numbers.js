@@ -107,12 +107,12 @@ function rounded(number, bits, least) {
   return step * (down + Number(rest > 0.5 || (rest === 0.5 && down % 2 !== 0)));
 }
 
-/** Parses a number of a floating-point type. */
+/** Parses a number of a floating-point type. In JSON, `-0` is an integer, which has no sign of zero. */
 function floating(text, plain, type) {
   const found = ROUNDINGS[type](Number(plain));
   if (!(Math.abs(found) <= TYPES[type].ends[1])) throw new Error(`“${text.trim()}” does not fit ${type}: ${extent(type)}`);
   if (found === 0 && /[1-9]/.test(plain.split(/e/i)[0])) throw new Error(`“${text.trim()}” is too small for ${type}, which would be 0`);
-  return plain;
+  return plain === "-0" ? "-0.0" : plain;
 }
 
 /** Parses a number of a type. Returns JSON text with the same digits. Throws an error for other text. */
