@@ -468,6 +468,19 @@ def test_a_token_is_asked_for_and_kept_in_the_tab_only(opened: Opened) -> None:
     assert not view.page.evaluate(kept.format("sessionStorage", SECRET))
 
 
+def test_a_token_that_can_not_be_sent_is_refused(opened: Opened) -> None:
+    view = opened(tokens=(("edge", hashlib.sha256(SECRET.encode()).digest()),))
+    box = view.page.get_by_label("Token", exact=True)
+    for text in ("correct-horse\u200b-battery-staple", "sch\u00f6n"):
+        expect(box).to_have_value("")
+        box.fill(text)
+        view.page.keyboard.press("Enter")
+        view.says("A token has only visible ASCII characters.")
+    box.fill(SECRET)
+    view.page.keyboard.press("Enter")
+    view.says("reads and writes")
+
+
 def test_a_token_that_is_given_late_allows_writing(opened: Opened) -> None:
     view = opened(tokens=(("edge", hashlib.sha256(SECRET.encode()).digest()),))
     box = view.page.get_by_label("Token", exact=True)

@@ -4,6 +4,8 @@ import { $, h } from "./dom.js";
 
 const KEY = "holdfast-token";
 export const JSON_TYPE = { "Content-Type": "application/json" };
+/** Tokens that a header can have. With another one, the browser sends nothing and reports no reason. */
+const SENDABLE = /^[\x21-\x7e]+$/;
 /** How long the gateway may need beyond the timeouts of the device, in milliseconds. */
 const GRACE = 10_000;
 
@@ -38,6 +40,10 @@ export const post = async (path, body, signal) =>
 export async function send(path, { extraTime = 0, signal, ...options } = {}) {
   for (;;) {
     const token = sessionStorage.getItem(KEY);
+    if (token !== null && !SENDABLE.test(token)) {
+      await askForToken("A token has only visible ASCII characters. This one has another character, maybe an invisible one.");
+      continue;
+    }
     const headers = { ...options.headers, ...(token ? { Authorization: `Bearer ${token}` } : {}) };
     const ending = new AbortController();
     const end = () => ending.abort();
