@@ -136,6 +136,68 @@ def test_a_list_with_errors_is_not_added(opened: Opened) -> None:
     expect(view.button("Remove 1 tag from the view")).to_be_visible()
 
 
+SEPARATED = """\
+tags:
+  label: {area: holding_registers, address: 20, type: "string:6", encoding: utf-8}
+  level: {area: holding_registers, address: 30, description: "Level\\u2028of the tank"}
+"""
+
+
+def with_raw_separators(route: Route) -> None:
+    """As a gateway that sends these characters as they are."""
+    answer = route.fetch()
+    body = answer.text().replace("\\u2028", "\u2028").replace("\\u2029", "\u2029")
+    route.fulfill(response=answer, body=body)
+
+
+@pytest.mark.parametrize("is_raw", [False, True], ids=["escaped", "raw"])
+def test_line_separators_of_unicode_stop_no_values(
+    opened: Opened, plant: holdfast.Memory, is_raw: bool
+) -> None:
+    plant.write("holding_registers", 20, [0x41E2, 0x80A9, 0x4200])
+    view = connected(opened)
+    add_tags(view, SEPARATED)
+    if is_raw:
+        view.page.route("**/api/modbus/watch/view", with_raw_separators)
+        view.button("Read").click()
+        view.says("2 tags: read in")
+    else:
+        view.choose(interval="50")
+        view.button("Watch").click()
+        view.says("Watching 2 tags")
+        plant.write("holding_registers", 30, [7])
+    expect(tag(view, "label")).to_contain_text("A\u2029B")
+    expect(tag(view, "level")).to_have_text("7" if not is_raw else "0")
+
+
+def test_an_event_that_can_not_be_read_is_an_error(opened: Opened) -> None:
+    def cut(route: Route) -> None:
+        answer = route.fetch()
+        route.fulfill(response=answer, body=answer.text().replace("data: ", "data "))
+
+    view = connected(opened)
+    view.page.route("**/api/modbus/watch/view", cut)
+    view.button("Read").click()
+    view.says("the gateway sent an event that can't be read")
+
+
+def test_changes_without_the_view_before_them_are_not_applied(opened: Opened) -> None:
+    def late(route: Route) -> None:
+        values = {"part": 0, "values": [[0, 4711]]}
+        data = json.dumps({"time": 1, "rtt": 1, "parts": [values]})
+        kind = {"Content-Type": "text/event-stream"}
+        route.fulfill(headers=kind, body=f"event: change\ndata: {data}\n\n")
+
+    view = connected(opened)
+    view.choose(address="4", quantity="1")
+    view.button("Read").click()
+    expect(view.row(4).get_by_role("cell").first).to_have_text("1234")
+    view.page.route("**/api/modbus/watch/view", late)
+    view.button("Watch").click()
+    view.says("The gateway ended the watch or does not answer.")
+    expect(view.row(4).get_by_role("cell").first).to_have_text("1234")
+
+
 def test_a_file_is_added(opened: Opened, tmp_path: Path) -> None:
     view = connected(opened)
     view.button("Add tag list…").click()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -81,6 +82,18 @@ def test_ranges_and_tag_lists_share_one_stream(
     assert changed(stream) == [{"part": 0, "values": [[1, 8]], "texts": [[1, "8"]]}]
     memory.write("holding_registers", 1, [0])
     assert changed(stream) == [{"part": 1, "values": [[1, 0]], "texts": [[1, "off"]]}]
+
+
+def test_an_event_has_no_character_that_may_end_a_line(
+    gateway: Running, server: holdfast.Server
+) -> None:
+    text = "A\x85B\u2028C\u2029D"
+    tags = f"name,area,address,type,description\nlevel,ir,2,uint16,{text}\n"
+    stream = view(gateway, server.address[1], {"tags": tags, "format": "csv"}, once=True)
+    received = stream.reply.read().decode()
+    _, data, _ = received.splitlines()
+    described = json.loads(data.removeprefix("data: "))["parts"][0]["tags"]
+    assert described[0]["description"] == text
 
 
 def test_every_poll_has_an_event(gateway: Running, server: holdfast.Server) -> None:

@@ -27,8 +27,11 @@ export async function stream(path, options, onEvent) {
     const events = (held + value).split("\n\n");
     held = events.pop();
     for (const event of events) {
-      const match = /^event: (.*)\ndata: (.*)$/.exec(event);
-      if (match) onEvent(match[1], JSON.parse(match[2]));
+      if (event.startsWith(":")) continue;
+      const match = /^event: ([^\n]*)\ndata: ([^\n]*)$/.exec(event);
+      // The events after a lost one would be taken for something else.
+      if (!match) throw new Problem("internal_error", "the gateway sent an event that can't be read");
+      onEvent(match[1], JSON.parse(match[2]));
     }
   }
 }

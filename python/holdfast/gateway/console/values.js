@@ -328,7 +328,7 @@ export class Values {
     say($("outcome"), "Reading…");
     let told = null;
     while (this.watching === stopping) {
-      let streams = true;
+      let streams = null; // Known from the `view` event, which says what the changes after it are of.
       // The profiles of the gateway may change at any time, other lists never do.
       const describe = !this.polls || wanted.some((part) => part.source?.profile);
       const more = { interval: this.interval, maxStreams: MAX_STREAMS.watch, describe };
@@ -338,13 +338,13 @@ export class Values {
           if (name === "view") {
             streams = data.stream;
             this.opened(wanted, data);
-          } else if (name === "change") {
+          } else if (name === "change" && streams !== null) {
             this.take(data, true);
           }
           told = null;
         });
         if (this.watching !== stopping) return;
-        if (!streams) {
+        if (streams === false) {
           await pause(this.interval);
           continue;
         }

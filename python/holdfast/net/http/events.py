@@ -39,7 +39,7 @@ class Stream:
     async def event(self, name: str, data: Any, number: int | None = None) -> None:
         """Sends one event with JSON data. `number` is its id."""
         head = b"" if number is None else b"id: %d\n" % number
-        body = b"event: %b\ndata: %b\n\n" % (name.encode(), msgspec.json.encode(data))
+        body = b"event: %b\ndata: %b\n\n" % (name.encode(), _line(data))
         await self._write(head + body)
 
     async def beat(self) -> None:
@@ -71,3 +71,11 @@ class Stream:
     async def _write(self, data: bytes) -> None:
         self._last = self._loop.time()
         await self._request.send(data)
+
+
+def _line(data: Any) -> bytes:
+    """Returns JSON without the characters that many clients take for the end of a line."""
+    line = msgspec.json.encode(data)
+    for character in "\x85\u2028\u2029":
+        line = line.replace(character.encode(), b"\\u%04x" % ord(character))
+    return line
