@@ -136,6 +136,18 @@ def test_a_list_with_errors_is_not_added(opened: Opened) -> None:
     expect(view.button("Remove 1 tag from the view")).to_be_visible()
 
 
+def test_profiles_that_can_not_be_listed_are_told(opened: Opened) -> None:
+    def busy(route: Route) -> None:
+        body = json.dumps({"success": False, "error": "too many requests"})
+        route.fulfill(status=503, headers={"Holdfast-Reason": "busy"}, body=body)
+
+    view = connected(opened)
+    view.page.route("**/api/gateway/profiles", busy)
+    view.button("Add tag list…").click()
+    told = "The profiles of the configuration can't be listed: too many requests"
+    expect(view.page.get_by_role("alert").filter(has_text=told)).to_be_visible()
+
+
 SEPARATED = """\
 tags:
   label: {area: holding_registers, address: 20, type: "string:6", encoding: utf-8}

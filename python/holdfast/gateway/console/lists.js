@@ -7,7 +7,7 @@ import { list } from "./parts.js";
 /** Returns the format of a tag list. */
 const formatOf = (name, text) => (/\.csv$/i.test(name) || !/^\s*(order|tags)\s*:/m.test(text) ? "csv" : "yaml");
 
-/** The dialog for tag lists. `add` takes the part that was chosen. */
+/** The dialog for tag lists. `add` takes the part that was chosen, or throws an error. */
 export class Lists {
   constructor(add) {
     this.add = add;
@@ -36,7 +36,10 @@ export class Lists {
     $("tags-profile").replaceChildren(h("option", { value: "" }, "None: the text below"));
     this.adapt();
     this.dialog.showModal();
-    const { profiles } = await get("/api/gateway/profiles").catch(() => ({ profiles: [] }));
+    const { profiles } = await get("/api/gateway/profiles").catch((error) => {
+      $("tags-error").textContent = `The profiles of the configuration can't be listed: ${error.message}`;
+      return { profiles: [] };
+    });
     $("tags-profile").append(...profiles.map(({ name, tags }) => h("option", { value: name }, `${name} (${tags} tags)`)));
     this.adapt();
   }
@@ -55,8 +58,8 @@ export class Lists {
     $("tags-error").textContent = "";
     try {
       const { tags } = await post("/api/gateway/tags", source);
-      this.dialog.close();
       this.add(list(profile || this.name || `${tags.length} ${tags.length === 1 ? "tag" : "tags"}`, source));
+      this.dialog.close();
     } catch (error) {
       $("tags-error").textContent = error.message;
     }
