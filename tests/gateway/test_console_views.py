@@ -136,6 +136,21 @@ def test_a_list_with_errors_is_not_added(opened: Opened) -> None:
     expect(view.button("Remove 1 tag from the view")).to_be_visible()
 
 
+def test_lists_that_are_too_large_together_are_not_added(opened: Opened) -> None:
+    view = connected(opened)
+    rows = "".join(f"tag_{at},hr,{at % 200},uint16,{'x' * 25}\n" for at in range(1000))
+    text = f"name,area,address,type,description\n{rows}"
+    add_tags(view, text)
+    view.button("Add tag list…").click()
+    view.page.get_by_role("textbox", name="YAML or CSV").fill(text)
+    view.button("Add").click()
+    told = "The parts of a view have at most 64512 bytes together."
+    expect(view.page.get_by_role("alert").filter(has_text=told)).to_be_visible()
+    view.button("Cancel").click()
+    view.button("Read").click()
+    view.says("1000 tags: read in")
+
+
 def test_profiles_that_can_not_be_listed_are_told(opened: Opened) -> None:
     def busy(route: Route) -> None:
         body = json.dumps({"success": False, "error": "too many requests"})

@@ -25,6 +25,8 @@ const FINAL = new Set(["malformed", "refused_target", "unauthorized", "foreign_p
 const FIELDS = ["area", "address", "quantity", "type", "size", "order", "letters", "interval"];
 const CSV = ["time", "part", "name", "area", "address", "type", "order", "value", "unit", "state", "error"];
 const CHECK = 1000;
+/** The most bytes of all parts: the body of a request has 64 KiB, with the device and the settings. */
+const MAX_PARTS_SIZE = 63 * 1024;
 /** How long the first poll of a tag list may take, in milliseconds. */
 const LONG = 60_000;
 
@@ -55,7 +57,12 @@ export class Values {
       else if ($("range").reportValidity()) this.watch(this.wanted());
     });
     $("add-range").addEventListener("click", () => {
-      if ($("range").reportValidity()) this.pin(this.range());
+      if (!$("range").reportValidity()) return;
+      try {
+        this.pin(this.range());
+      } catch (error) {
+        say($("outcome"), error.message);
+      }
     });
     $("add-tags").addEventListener("click", () => this.lists.ask());
     $("save").addEventListener("click", () => this.save());
@@ -175,9 +182,12 @@ export class Values {
     return this.pinned.length > 0 ? this.pinned : [this.range()];
   }
 
-  /** Adds a part to the view. */
+  /** Adds a part to the view. Throws an error if the gateway would not take the view. */
   pin(part) {
-    this.pinned = [...this.pinned, part];
+    const pinned = [...this.pinned, part];
+    const size = new TextEncoder().encode(JSON.stringify(pinned.map(parts.asked))).length;
+    if (size > MAX_PARTS_SIZE) throw new Error(`The parts of a view have at most ${MAX_PARTS_SIZE} bytes together. With this one, they have ${size}.`);
+    this.pinned = pinned;
     this.repinned();
   }
 
