@@ -135,6 +135,12 @@ def test_an_exception_can_leave_it_open_whether_a_write_was_carried_out(
         assert answer(*arguments, code=1)["maybe_written"]
 
 
+def test_what_can_not_be_read_back_is_written(tags: tuple[str, str]) -> None:
+    with FakeDevice(lambda pdu: pdu if pdu[0] in (5, 6) else exception(pdu, 1)) as device:
+        found = answer("write", device.url, "pump=run", *tags, "--verify", code=1)
+    assert (found["written"], found["maybe_written"]) == (["pump"], False)
+
+
 def test_a_value_that_is_read_back_different_is_a_failure(tags: tuple[str, str]) -> None:
     def stubborn(pdu: bytes) -> bytes:
         return pdu if pdu[0] == 6 else registers(pdu, 200)

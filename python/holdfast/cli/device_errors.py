@@ -11,6 +11,8 @@ from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.base import MAX_TIMEOUT_S
 from holdfast.errors import (
+    NOT_EXECUTED,
+    ConnectFailed,
     ConnectionLost,
     InvalidResponse,
     ModbusError,
@@ -54,10 +56,13 @@ def of_write(found: ModbusError | KeyboardInterrupt) -> ModbusError:
 
 
 def maybe_written(error: ModbusError) -> bool:
-    """Whether the device may have carried out the write that ended with this error."""
+    """Whether the device may have carried out the request that ended with this error.
+
+    Earlier requests of a split write, which are written, don't count.
+    """
     if isinstance(error, ModbusException):
-        return error.maybe_executed
-    return getattr(error, "maybe_sent", True)
+        return error.code not in NOT_EXECUTED
+    return not isinstance(error, ConnectFailed) and getattr(error, "maybe_sent", True)
 
 
 def differs(wrong: Sequence[str]) -> dict[str, object]:

@@ -160,7 +160,9 @@ def _carry_out(
         except (ModbusError, KeyboardInterrupt) as found:
             error = device_errors.of_write(found)
             maybe = device_errors.maybe_written(error)
-            shown = fields | {"maybe_written": maybe} if as_json else None
+            # It is not known how much of a split write Ctrl-C has left.
+            written = {"written": found.written} if isinstance(found, ModbusError) else {}
+            shown = {**fields, **written, "maybe_written": maybe} if as_json else None
             first = f"{job.where} was possibly written" if maybe else None
             device_errors.fail(error, url, shown, first, is_in_area=isinstance(job, _Job))
         try:
@@ -168,7 +170,8 @@ def _carry_out(
         except ModbusError as error:
             if not as_json:
                 click.echo(f"{job.summary}; could not be read back", err=True)
-            shown = fields | {"maybe_written": True} if as_json else None
+            written = {"written": fields["count"], "maybe_written": False}
+            shown = fields | written if as_json else None
             device_errors.fail(error, url, shown, is_in_area=isinstance(job, _Job))
     if as_json:
         verified = {"verified": not differing} if verify else {}

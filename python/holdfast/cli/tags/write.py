@@ -114,7 +114,7 @@ def _differing(
         found = {write.tag.name: (write, write.read_back(client)) for write in writes}
     except ModbusError as error:
         names = [write.tag.name for write in writes]
-        fields = {"target": of.url, "unit": of.unit, "written": names, "maybe_written": True}
+        fields = {"target": of.url, "unit": of.unit, "written": names, "maybe_written": False}
         if not as_json:
             click.echo("Could not be read back.", err=True)
         device_errors.fail(error, of.url, fields if as_json else None)
