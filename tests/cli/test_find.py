@@ -111,6 +111,16 @@ def test_a_gateway_without_its_device_is_found() -> None:
     assert (found["found"][0]["modbus"], found["found"][0]["unit"]) == (True, None)
 
 
+def test_a_host_without_function_43_is_asked_for_function_17() -> None:
+    def behave(asked: Asked) -> None:
+        reports = asked.pdu[0] == 17
+        asked.answer(b"\x11\x0a\x01\xffPUMP 7.1" if reports else exception(asked.pdu, 1))
+
+    with Stream("tcp", then=behave) as host:
+        found = done("find", "127.0.0.1", "--port", str(host.port))
+    assert "PUMP 7.1" in "".join(found)
+
+
 def test_nothing_is_a_failure() -> None:
     with socket.create_server(("127.0.0.1", 0)) as unused:
         port = unused.getsockname()[1]

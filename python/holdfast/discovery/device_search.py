@@ -192,8 +192,11 @@ async def _ask(host: Host, client: Client, units: Sequence[int]) -> None:
                 host.detail = str(error)
             continue
         host.state, host.unit = "modbus", unit
-        with contextlib.suppress(ModbusError):
+        try:
             host.identity = identity(await client.identify(unit=unit))
+        except ModbusError:
+            with contextlib.suppress(ModbusError):
+                host.identity = server_identity(await client.report_server_id(unit=unit))
         return
 
 
