@@ -1445,12 +1445,12 @@ class Passage:
     def device_of(self, area: Area, address: int, count: int) -> str | None:
         """The device that takes a write of this range, `None` if it is not within one range."""
 
-    def write(self, area: Area, address: int, values: list[int]) -> int:
+    def write(self, area: Area, address: int, values: list[int]) -> int | None:
         """Writes to the device, and to the memory when the device has confirmed it.
 
-        Blocks until the device has answered, or did not in time. Returns 0, or the exception code:
-        of the device, 10 if it can't be reached, 11 if it does not answer. Raises `ValueError` for
-        more values than a request can have.
+        Blocks until the device has answered, or did not in time. Returns `None` if the device has
+        confirmed the write, otherwise the exception code: of the device, 10 if it can't be reached,
+        11 if it does not answer. Raises `ValueError` for more values than a request can have.
         """
 
     def call(self, caller: Caller, area: Area, address: int, values: list[int]) -> int:

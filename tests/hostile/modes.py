@@ -397,6 +397,7 @@ CONNECTIONS = {
 REFUSALS = {
     "silent at one address": Mode(silent_at(4)),
     "exception: instead": Mode(sometimes(instead(exception(4)))),
+    "exception: 00 instead": Mode(sometimes(instead(exception(0)))),
     "exception: before": Mode(before(exception(4), 5 * MS), always),
     "exception: of a gateway, then the reply": Mode(sometimes(half_a_timeout(exception(0x0B)))),
     "exception: of a gateway, then the reply, slowly": Mode(

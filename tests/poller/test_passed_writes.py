@@ -343,13 +343,21 @@ def test_rest_writes_through_too_and_tells_the_exception(run: Run) -> None:
         assert writes_of(source) == [b"\x10\x01\xf4\x00\x02\x04\x00\x03\x00\x04"]
         assert appliance.memories["mirror"].read("holding_registers", 10, 3) == [3, 4, 502]
         assert (both.status, both.json["reason"]) == (409, "mirrored")
-    with plc(refuse_writes) as source:
+
+
+@pytest.mark.parametrize("code", [0, 4])
+def test_rest_shows_the_exception_of_the_device(code: int, run: Run) -> None:
+    def refuse(asked: Asked) -> None:
+        asked.answer(exception(asked.pdu, code) if asked.pdu[0] > 4 else None)
+
+    with plc(refuse) as source:
         appliance = started(run, source)
         rest = web.Client(endpoint(appliance, "rest"))
         with contextlib.closing(rest):
             refused = rest.ingest(web.command("holding_registers", 10, [3], "mirror"))
         assert (refused.status, refused.json["reason"]) == (502, "device_refused")
-        assert "meter did not take the write: exception 04" in refused.json["detail"]
+        assert f"meter did not take the write: exception {code:02X}" in refused.json["detail"]
+        assert appliance.memories["mirror"].read("holding_registers", 10, 1) == [500]
 
 
 class HeldWrites:

@@ -346,6 +346,7 @@ def no_header(request: wire.Frame) -> bytes:
         (wrong_function, INVALID, "transport_errors"),
         (unasked, INVALID, "transport_errors"),
         (no_header, INVALID, "transport_errors"),
+        (lambda request: exception(request, 0), 0x0100, "exceptions"),
         (lambda request: exception(request, 1), 1, "exceptions"),
         (lambda request: exception(request, 2), 2, "exceptions"),
         (lambda request: exception(request, 4), 4, "exceptions"),

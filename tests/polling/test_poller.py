@@ -16,7 +16,7 @@ from holdfast.polling.faults import NO_CONNECTION
 from holdfast.tags.scale import RegisterScale
 from support import wire
 from support.brokers import free_port
-from support.fake_device import Asked, Stream, good
+from support.fake_device import Asked, FakeDevice, Stream, exception, good
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -171,6 +171,15 @@ def test_a_write_that_is_refused_says_so(device: holdfast.Server, poller: Poller
     with pytest.raises(WriteFailed, match=r"oven\.x: exception 02") as caught:
         poller.write("oven", "x", 1)
     assert caught.value.fault == 2
+
+
+def test_exception_00_is_an_error(poller: Poller) -> None:
+    with FakeDevice(lambda pdu: exception(pdu, 0)) as device:
+        poller.add(device.url, {"x": ("holding_registers", 0)}, name="oven")
+        with pytest.raises(WriteFailed, match=r"oven\.x: exception 00"):
+            poller.write("oven", "x", 1)
+        reading = next(iter(taken(poller)))
+    assert (reading.value, reading.error) == (None, "exception 00")
 
 
 def test_devices_can_be_added_and_removed(device: holdfast.Server, poller: Poller) -> None:

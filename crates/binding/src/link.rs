@@ -190,11 +190,15 @@ impl Passage {
         Ok(self.core.device_of(named(area)?, address, count))
     }
 
-    /// Returns the code of the exception, 0 if the device has confirmed the write.
-    fn write(&self, py: Python<'_>, area: &str, address: u16, values: Vec<u16>) -> PyResult<u8> {
-        with_write(area, address, &values, |request| {
-            py.detach(|| self.core.write(request)).err().unwrap_or(0)
-        })
+    /// Returns the code of the exception, `None` if the device has confirmed the write.
+    fn write(
+        &self,
+        py: Python<'_>,
+        area: &str,
+        address: u16,
+        values: Vec<u16>,
+    ) -> PyResult<Option<u8>> {
+        with_write(area, address, &values, |request| py.detach(|| self.core.write(request)).err())
     }
 
     fn call(

@@ -188,9 +188,9 @@ class MemoryAccess:
         """Sends a write for a device on its way. Returns the ticket. Raises `Refused`."""
         return self._to_device(begun, lambda passage, *write: passage.call(caller, *write))
 
-    def answered(self, begun: Begun, code: int) -> Written:
-        """Takes the answer of the device: 0, or the code of an exception. Raises `Refused`."""
-        if code == 0:
+    def answered(self, begun: Begun, code: int | None) -> Written:
+        """Takes the answer of the device: the code of its exception, if any. Raises `Refused`."""
+        if code is None:
             if begun.recording is not None:
                 begun.recording.done()
             return self._accepted(begun, len(values_of(begun.batch[0])))
@@ -416,7 +416,7 @@ class MemoryAccess:
             error.is_recorded = True
         raise error from None
 
-    def _to_device(self, begun: Begun, write: Callable[..., int]) -> int:
+    def _to_device(self, begun: Begun, write: Callable[..., Any]) -> Any:
         """Calls `write` with the passage, area, address and values. Raises `Refused`."""
         [command] = begun.batch
         values = [int(value) for value in values_of(command)]

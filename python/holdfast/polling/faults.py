@@ -7,7 +7,8 @@ from holdfast.errors import ModbusException
 
 FAULTS = _core.FAULTS
 """Why a polled device did not answer, as a word, with the fault code of the poller. A fault with
-another code is an exception of the device.
+another code is an exception of the device: the low byte is its number, and 0x0100 is exception 00,
+as 0 is no fault.
 """
 
 NO_CONNECTION = FAULTS["refused"]
@@ -41,7 +42,7 @@ def fault_word(fault: int) -> str:
     """A fault as a word for logs: `timeout`, `exception 02`, `none` for 0."""
     if fault == 0:
         return "none"
-    return _WORDS.get(fault, f"exception {fault:02X}")
+    return _WORDS.get(fault, f"exception {fault & 0xFF:02X}")
 
 
 def fault_text(fault: int) -> str:

@@ -11,6 +11,9 @@ use crate::client::ClientError;
 /// Errors from this code on are not exceptions.
 const NO_EXCEPTION: u16 = 0x8000;
 
+/// The code of exception 00, which some devices send. 0 is no fault.
+const EXCEPTION_00: u16 = 0x0100;
+
 /// Makes `Fault`: what is no exception has a number, and a word for people.
 macro_rules! faults {
     ($($(#[$about:meta])* $fault:ident = $number:literal, $word:literal;)*) => {
@@ -25,8 +28,10 @@ macro_rules! faults {
             /// All but exceptions, each with its word.
             pub const NAMED: &[(Fault, &str)] = &[$((Fault::$fault, $word)),*];
 
+            /// Never 0, which means no fault.
             pub const fn code(self) -> u16 {
                 match self {
+                    Fault::Exception(0) => EXCEPTION_00,
                     Fault::Exception(code) => code as u16,
                     $(Fault::$fault => NO_EXCEPTION + $number,)*
                 }
@@ -141,6 +146,8 @@ fn is_unreachable(why: ErrorKind) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
 
     #[test]
@@ -161,5 +168,13 @@ mod tests {
             assert_eq!(failed(kind), Fault::Refused, "{kind:?}");
         }
         assert_eq!(Fault::Unreachable.code(), 0x800B);
+    }
+
+    #[test]
+    fn every_exception_has_a_code_of_its_own_which_is_not_0() {
+        let codes: BTreeSet<u16> =
+            (0..=u8::MAX).map(|code| Fault::Exception(code).code()).collect();
+        assert_eq!((codes.len(), codes.contains(&0)), (256, false));
+        assert!(codes.iter().all(|code| *code < NO_EXCEPTION));
     }
 }

@@ -60,8 +60,8 @@ class DeviceWrites:
                 self._waiting[device] -= 1
                 self._close_after_last()
 
-    async def _answer(self, request: Request, begun: Begun) -> int:
-        """Returns the answer of the device: 0, or the code of an exception. Raises `Refused`."""
+    async def _answer(self, request: Request, begun: Begun) -> int | None:
+        """The answer of the device: the code of its exception, if any. Raises `Refused`."""
         if self._calls is None:
             async with self._opening:
                 self._calls = self._calls or await Calls.opened()
@@ -90,7 +90,7 @@ class DeviceWrites:
             return result.code
         if isinstance(result, ModbusError):
             return TARGET_SILENT if sent else PATH_UNAVAILABLE
-        return 0
+        return None
 
     def _close_after_last(self) -> None:
         if self._is_ending and self._calls is not None and not any(self._waiting.values()):
