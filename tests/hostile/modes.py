@@ -330,10 +330,7 @@ IN_PIECES = {
     "cut off, joined with the whole": Mode(sometimes(joined(begun, right))),
     "cut off late": Mode(sometimes(instead(nearly_all))),
     "cut off late, joined with the whole": Mode(sometimes(joined(nearly_all, right))),
-    "cut off late, then whole": Mode(
-        sometimes(before(nearly_all, 2 * MS)), is_undetectable=is_tcp,
-        reason="MBAP frames have no check sum, and the first bytes of the next complete it",
-    ),
+    "cut off late, then whole": Mode(sometimes(before(nearly_all, 2 * MS))),
 }  # fmt: skip
 
 CONFIRMS = "the reply to function 5 or 6 is the request"

@@ -1149,6 +1149,28 @@ fn a_reply_that_is_cut_off_by_another_one_is_not_believed() {
             "{cut} {got:?}"
         );
     }
+    // Whatever the other reply answers, and however little of it shows that it is no frame.
+    let late = mbap_frame(0, 7, &[6, 0, 5, 0x46, 0xD7]);
+    let answered = mbap_frame(1, 7, &[3, 4, 0x11, 0x11, 0x22, 0x22]);
+    for other in [&late, &answered] {
+        for missing in 1..=4 {
+            let mut client = Client::new(Transport::Tcp);
+            client.send(request);
+            client.after(SECOND);
+            client.send(request);
+            client.receive(&answered);
+            let ticket = client.send(request);
+            client.got();
+            let cut_off = mbap_frame(2, 7, &[3, 4, 0, 1, 0, 2]);
+            client.receive(&cut_off[..cut_off.len() - missing]);
+            client.receive(other);
+            let got = client.got();
+            assert!(
+                matches!(got[..], [(of, Err(Failure::Invalid(_)))] if of == ticket),
+                "{missing} {got:?}"
+            );
+        }
+    }
     // With nothing of another reply in it, what follows does not matter.
     let mut client = Client::new(Transport::Tcp);
     let ticket = client.send(request);

@@ -49,7 +49,7 @@ impl GivenUp {
     }
 }
 
-/// Given up requests whose transaction ids the next connection knows.
+/// The latest transaction ids whose replies may still come, also on the next connection.
 const MAX_REMEMBERED_IDS: u16 = 4096;
 
 impl Stream {
@@ -61,8 +61,13 @@ impl Stream {
     pub(super) fn take_ids(&mut self, flights: &Flights) -> (u16, Vec<u16>) {
         let given_up = core::mem::take(&mut self.given_up).into_keys();
         let mut ids: Vec<u16> = given_up.chain(flights.unanswered.iter().copied()).collect();
-        ids.retain(|id| self.next_id.wrapping_sub(*id) <= MAX_REMEMBERED_IDS);
+        ids.retain(|id| self.is_recent(*id));
         (self.next_id, ids)
+    }
+
+    /// Whether a request, also one of an earlier connection, had this transaction id not long ago.
+    fn is_recent(&self, id: u16) -> bool {
+        self.next_id.wrapping_sub(id) <= MAX_REMEMBERED_IDS
     }
 
     /// Goes on where another connection ended.
@@ -139,7 +144,8 @@ impl Stream {
                     flights.strays.bytes += rest.len() as u64;
                     Some(InvalidResponse::Length(length))
                 }
-                Next::Frame { len, .. } if is_cut_off(flights, rest, len) => {
+                // Behind an exception reply that is padded, there may be anything.
+                Next::Frame { len, .. } if surplus.is_none() && self.is_cut_off(rest, len) => {
                     flights.strays.bytes += rest.len() as u64;
                     Some(InvalidResponse::Unrequested)
                 }
@@ -253,6 +259,19 @@ impl Stream {
         }
     }
 
+    /// Whether another reply begins in the frame at the start of `bytes`, which was cut off: there is no check
+    /// sum that would show it. What follows the frame is then no frame. The other reply may also be a late
+    /// one, or come again.
+    fn is_cut_off(&self, bytes: &[u8], len: usize) -> bool {
+        let behind = bytes.get(len..).unwrap_or_default();
+        let has_protocol_id = behind.iter().skip(2).take(2).any(|byte| *byte != 0);
+        (has_protocol_id || matches!(mbap::next(behind), Next::Broken { .. }))
+            && (mbap::HEADER_LEN + 1..len).any(|at| match bytes.get(at..) {
+                Some([high, low, 0, 0, ..]) => self.is_recent(u16::from_be_bytes([*high, *low])),
+                _ => false,
+            })
+    }
+
     /// Whether the incomplete reply belongs to an abandoned request: if the rest never arrives, the
     /// next reply would be taken for it.
     fn has_broken_off(&self, flights: &Flights) -> bool {
@@ -261,22 +280,6 @@ impl Stream {
             None => !self.partial.is_empty() && flights.len() == 0,
         }
     }
-}
-
-/// Whether another reply begins in the frame at the start of `bytes`, which was cut off: there is no check sum
-/// that would show it. What follows the frame is then no frame.
-fn is_cut_off(flights: &Flights, bytes: &[u8], len: usize) -> bool {
-    let behind = match mbap::next(bytes.get(len..).unwrap_or_default()) {
-        Next::Foreign { .. } | Next::Broken { .. } => true,
-        Next::Incomplete | Next::Frame { .. } => false,
-    };
-    behind
-        && (mbap::HEADER_LEN + 1..len).any(|at| match bytes.get(at..) {
-            Some([high, low, 0, 0, ..]) => {
-                flights.position(u16::from_be_bytes([*high, *low])).is_some()
-            }
-            _ => false,
-        })
 }
 
 fn frame_len(flight: &Flight) -> usize {
