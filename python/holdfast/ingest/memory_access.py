@@ -186,7 +186,8 @@ class MemoryAccess:
 
     def call_device(self, begun: Begun, caller: _core.Caller) -> int:
         """Sends a write for a device on its way. Returns the ticket. Raises `Refused`."""
-        return self._to_device(begun, lambda passage, *write: passage.call(caller, *write))
+        ticket: int = self._to_device(begun, lambda passage, *write: passage.call(caller, *write))
+        return ticket
 
     def answered(self, begun: Begun, code: int | None) -> Written:
         """Takes the answer of the device: the code of its exception, if any. Raises `Refused`."""

@@ -1,7 +1,8 @@
 """The interface of a part of a running appliance.
 
 The appliance walks its list of parts forwards to start, to reload and to request the stop, and
-backwards to close. An order that matters is a place in the list, a step of its own here, or a rank at the end.
+backwards to close. An order that matters is a place in the list, a step of its own here, or a rank
+at the end.
 """
 
 from __future__ import annotations

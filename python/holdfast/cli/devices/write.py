@@ -170,8 +170,8 @@ def _carry_out(
         except ModbusError as error:
             if not as_json:
                 click.echo(f"{job.summary}; could not be read back", err=True)
-            written = {"written": fields["count"], "maybe_written": False}
-            shown = fields | written if as_json else None
+            certain = {**fields, "written": fields["count"], "maybe_written": False}
+            shown = certain if as_json else None
             device_errors.fail(error, url, shown, is_in_area=isinstance(job, _Job))
     if as_json:
         verified = {"verified": not differing} if verify else {}
