@@ -71,14 +71,26 @@ impl Fault {
     }
 
     /// The code of the exception that a client of a gateway gets for it (V1.1b3, 7): that of the device,
-    /// or whether its address or only the device could not be reached.
-    pub(crate) fn exception(self, is_unreachable: bool) -> u8 {
+    /// or that its address could not be reached. After that one, clients send a write again: nothing was
+    /// sent. Any other fault counts as a device that did not answer.
+    pub(crate) fn exception(self) -> u8 {
         match self {
             Fault::Exception(code) => code,
-            Fault::Standby => ExceptionCode::GatewayPathUnavailable.code(),
-            _ if is_unreachable => ExceptionCode::GatewayPathUnavailable.code(),
+            Fault::Refused | Fault::Unreachable | Fault::Standby => {
+                ExceptionCode::GatewayPathUnavailable.code()
+            }
             _ => ExceptionCode::GatewayTargetFailedToRespond.code(),
         }
+    }
+}
+
+/// As [`Fault::exception`], for an error, which also shows a timeout before anything was sent.
+pub(super) fn exception_code(error: &ClientError) -> u8 {
+    match error {
+        ClientError::ConnectTimeout { .. } | ClientError::LookupTimeout { .. } => {
+            Fault::Unreachable.exception()
+        }
+        _ => fault(error).exception(),
     }
 }
 
@@ -147,8 +159,12 @@ fn is_unreachable(why: ErrorKind) -> bool {
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeSet;
+    use std::time::Duration;
+
+    use holdfast_protocol::client::Closed;
 
     use super::*;
+    use crate::client::Lost;
 
     #[test]
     fn what_reaches_nobody_is_not_refused() {
@@ -168,6 +184,23 @@ mod tests {
             assert_eq!(failed(kind), Fault::Refused, "{kind:?}");
         }
         assert_eq!(Fault::Unreachable.code(), 0x800B);
+    }
+
+    #[test]
+    fn only_what_was_not_sent_is_a_path_that_is_not_available() {
+        let to = String::from("tcp://192.0.2.1:502");
+        let refused = ErrorKind::ConnectionRefused.into();
+        for (error, code) in [
+            (ClientError::Connect { to: to.clone(), error: refused }, 0x0A),
+            (ClientError::ConnectTimeout { to, after: Duration::ZERO }, 0x0A),
+            (ClientError::Fenced, 0x0A),
+            (ClientError::Timeout(Duration::ZERO), 0x0B),
+            (ClientError::Lost(Lost::Closed(Closed::BySelf)), 0x0B),
+            (FLOODED, 0x0B),
+            (ClientError::Exception(4), 4),
+        ] {
+            assert_eq!(exception_code(&error), code, "{error}");
+        }
     }
 
     #[test]

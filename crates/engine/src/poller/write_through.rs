@@ -285,7 +285,7 @@ impl PassedWrite {
         };
         let pdu = match answered {
             Ok(answer) => return self.confirm(&answer, value, permit).await,
-            Err(fault) => exception(&self.pdu, fault.exception(link.retry_at().is_some())),
+            Err(fault) => exception(&self.pdu, fault.exception()),
         };
         self.reply.send(pdu);
         Vec::new()

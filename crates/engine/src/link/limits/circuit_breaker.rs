@@ -93,11 +93,6 @@ impl CircuitBreakers {
             units.remove(&unit_id);
         }
     }
-
-    /// Whether the address could not be reached the last time.
-    pub(in crate::link) fn is_unreachable(&self) -> bool {
-        self.address.get().is_some()
-    }
 }
 
 #[cfg(test)]

@@ -11,7 +11,7 @@ use tokio::task::spawn_local;
 
 use crate::client::ClientError;
 use crate::link::access::Link;
-use crate::link::fault::{Exchanged, Fault, exception, fault};
+use crate::link::fault::{Exchanged, Fault, exception, exception_code, fault};
 use crate::link::limits::circuit_breaker::CircuitBreakers;
 use crate::link::limits::permit::Permit;
 use crate::link::route::{Call, LinkCounters, LinkSettings, Reply, SharedLink};
@@ -102,7 +102,7 @@ impl Serving {
             Fault::Timeout => counters.timeouts.add(),
             _ => counters.failures.add(),
         }
-        let pdu = exception(request.pdu(), fault.exception(self.breakers.is_unreachable()));
+        let pdu = exception(request.pdu(), exception_code(&error));
         replies.into_iter().for_each(|reply| reply.send(Err((&error, &pdu))));
     }
 
