@@ -31,7 +31,7 @@ from holdfast.net.tls import NO_FILES, Tls
 from holdfast.runtime.standstill import now
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable
+    from collections.abc import Awaitable, Callable, Collection
     from urllib.parse import ParseResult
 
     from nats.aio.subscription import Subscription
@@ -351,11 +351,11 @@ class SafeClient(Client):
         task = self._reconnection_task
         return self.is_reconnecting and task is not None and task.done()
 
-    async def drain_all(self, subscriptions: Iterable[Subscription]) -> None:
+    async def drain_all(self, subscriptions: Collection[Subscription]) -> None:
         """Ends subscriptions, after the handlers were called for all that the server has sent."""
-        subscriptions = tuple(subscriptions)
-        for each in subscriptions:
-            await self._send_unsubscribe(each._id)
+        for number, each in list(self._subs.items()):
+            if each in subscriptions:
+                await self._send_unsubscribe(number)
         # nats-py sends the ping of a flush before what is still in its buffer, so that `drain`
         # alone loses messages.
         await self.flush()
