@@ -1,9 +1,9 @@
 //! `Request`, `Endpoint` and `BlockingClient`: requests, and their results or exceptions.
 
-use std::cell::RefCell;
+use std::cell::{Cell, RefCell};
 use std::path::PathBuf;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex};
 
 use holdfast_engine::client::{
     BlockingClient as Core, ClientError, Direction, Endpoint as CoreEndpoint, Lost, Place,
@@ -19,7 +19,6 @@ use holdfast_protocol::pdu::{
     self, Bits, Diagnostics, EncodedRequest, ExceptionCode, FileRange, FileRanges, FileRecords,
     Range, Registers, Request as CoreRequest, RequestError, Response, SubFunction, limit,
 };
-use holdfast_runtime::lock;
 use pyo3::exceptions::{PyException, PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyList};
@@ -326,8 +325,6 @@ pub struct BlockingClient {
     core: Core,
     /// How often calls were ended.
     ended: AtomicU64,
-    /// What a signal handler has raised in the trace.
-    interrupt: Arc<Mutex<Option<PyErr>>>,
 }
 
 #[pymethods]
@@ -336,19 +333,15 @@ impl BlockingClient {
     #[pyo3(signature = (endpoint, trace=None))]
     fn new(endpoint: PyRef<'_, Endpoint>, trace: Option<Py<PyAny>>) -> BlockingClient {
         let core = Core::new(endpoint.core.clone());
-        let interrupt = Arc::new(Mutex::new(None));
         let core = match trace {
             None => core,
-            Some(trace) => {
-                let interrupt = Arc::clone(&interrupt);
-                core.traced(Arc::new(move |direction, bytes| {
-                    if let Some(raised) = show(&trace, direction, bytes) {
-                        *lock(&interrupt) = Some(raised);
-                    }
-                }))
-            }
+            Some(trace) => core.traced(Arc::new(move |direction, bytes| {
+                if let Some(raised) = show(&trace, direction, bytes) {
+                    RAISED.set(Some(raised));
+                }
+            })),
         };
-        BlockingClient { core, ended: AtomicU64::new(0), interrupt }
+        BlockingClient { core, ended: AtomicU64::new(0) }
     }
 
     /// Sends a request and returns its result as a Python object.
@@ -405,14 +398,12 @@ thread_local! {
     /// The clients with a call in this thread, as addresses. Signal handlers and the trace run within
     /// a call: one that called its client, directly or within a call of another, would wait for ever.
     static CALLING: RefCell<Vec<usize>> = const { RefCell::new(Vec::new()) };
+
+    /// What a signal handler has raised in the trace of a call in this thread.
+    static RAISED: Cell<Option<PyErr>> = const { Cell::new(None) };
 }
 
 impl BlockingClient {
-    /// Runs signal handlers, and returns what one has raised, here or in the trace.
-    fn interrupted(&self) -> Option<PyErr> {
-        lock(&self.interrupt).take().or_else(|| Python::attach(|py| py.check_signals()).err())
-    }
-
     /// Runs `work` without the interpreter. While it waits, handlers of Python signals run; an
     /// exception of a handler ends it, as does `end_call`.
     fn interruptible<T: Send>(
@@ -434,13 +425,14 @@ impl BlockingClient {
                 if self.ended.load(Ordering::Relaxed) != ended {
                     return true;
                 }
-                raised = self.interrupted();
+                // Before the handlers: nothing that one of them raised is lost.
+                raised = RAISED.take().or_else(|| Python::attach(|py| py.check_signals()).err());
                 raised.is_some()
             })
         });
         CALLING.with_borrow_mut(Vec::pop);
-        let raised = raised.or_else(|| lock(&self.interrupt).take());
-        raised.map_or(Ok(result), Err)
+        let in_trace = RAISED.take();
+        raised.or(in_trace).map_or(Ok(result), Err)
     }
 }
 

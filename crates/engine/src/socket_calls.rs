@@ -1,19 +1,19 @@
 //! Receiving and sending on the TCP sockets of the runtime, for servers and clients.
 //!
 //! In a process with several threads, the C library notes around each such call that the thread may be
-//! cancelled in it. On Unix, the system is called without that: it takes a thirtieth of a request.
+//! cancelled in it. On Linux, the system is called without that: it takes a thirtieth of a request.
 
 use std::io::{self, ErrorKind};
 use std::task::{Context, Poll, ready};
 
-#[cfg(unix)]
+#[cfg(target_os = "linux")]
 use rustix::net::{RecvFlags, SendFlags};
-#[cfg(unix)]
+#[cfg(target_os = "linux")]
 use tokio::io::Interest;
 use tokio::net::TcpStream;
 
 /// Receives once. Returns the number of bytes, 0 at the end of the stream.
-#[cfg(unix)]
+#[cfg(target_os = "linux")]
 #[inline]
 pub(crate) fn poll_receive(
     socket: &TcpStream,
@@ -38,7 +38,7 @@ pub(crate) fn poll_receive(
     }
 }
 
-#[cfg(not(unix))]
+#[cfg(not(target_os = "linux"))]
 pub(crate) fn poll_receive(
     socket: &TcpStream,
     context: &mut Context<'_>,
@@ -56,10 +56,10 @@ pub(crate) fn poll_receive(
 /// Sends once, without blocking. Returns the number of bytes that the system has accepted.
 #[inline]
 pub(crate) fn send(socket: &TcpStream, output: &[u8]) -> io::Result<usize> {
-    #[cfg(unix)]
+    #[cfg(target_os = "linux")]
     return socket.try_io(Interest::WRITABLE, || {
         Ok(rustix::net::send(socket, output, SendFlags::NOSIGNAL)?)
     });
-    #[cfg(not(unix))]
+    #[cfg(not(target_os = "linux"))]
     return socket.try_write(output);
 }

@@ -56,6 +56,7 @@ class NotImportable(ConfigError):
 
     def __init__(self, file: str, problems: Iterable[Problem], notes: tuple[Note, ...]) -> None:
         super().__init__(file, problems)
+        self.args = (file, self.problems, notes)
         self.notes = notes
 
 

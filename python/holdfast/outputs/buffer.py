@@ -81,7 +81,8 @@ class Buffer:
             return self._batch
         # The readings in the file are older than those in memory.
         if self.stored is not None and self.stored.count:
-            self._batch, self._is_batch_stored = self.stored.first(max_readings), True
+            self._batch = self.stored.first(max_readings)
+            self._is_batch_stored = bool(self._batch)
             self.dropped += self.stored.damaged
             self.stored.damaged = 0
             return self._batch

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+import time
 from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
@@ -47,8 +48,8 @@ STOP_STEP_TIMEOUT_S = 2.0
 """Timeout of each step of a stop."""
 
 REQUESTS_TIMEOUT_S = 3.0
-"""Timeout at a stop of the requests that are being carried out: that of a device, by default. An
-appliance waits 5 s for all of the stop."""
+"""Timeout at a stop for the last requests to arrive and to be carried out: that of a device, by
+default. An appliance waits 5 s for all of the stop."""
 
 
 class Scanner:
@@ -141,6 +142,8 @@ class Scanner:
         """
         device_tls.check(self._settings.device_tls)
         self._polling.start(self._devices.on_poll)
+        if self._buckets.is_enabled is not None:
+            self._polling.pause()  # Until it is known whether devices may be polled.
         # Before requests arrive, which may end what is restored.
         await self._restore_former()
         works = [
@@ -166,8 +169,9 @@ class Scanner:
             log_lines.LOGGER.removeHandler(log_mirror)
 
     async def _restore_former(self) -> None:
+        former, self._former = self._former, ()
         if self._settings.fleet is None:  # A fleet has stored all of them.
-            await asyncio.gather(*map(self._restore, self._former))
+            await asyncio.gather(*map(self._restore, former))
 
     async def _restore(self, request: SubscribeRequest) -> None:
         about = {"device": request.device_id, "subscriber": request.subscriber_id}
@@ -259,9 +263,11 @@ class Scanner:
         """Stops all parts, each with a timeout."""
         # First nothing new may begin; then other nodes take over while this one still polls.
         self._buckets.connected(None)
+        began = time.monotonic()
         await tasks.within(STOP_STEP_TIMEOUT_S, self._broker.drain())
+        left_s = max(0.0, began + REQUESTS_TIMEOUT_S - time.monotonic())
         await self._placement.leave()
-        await self._responder.finish(REQUESTS_TIMEOUT_S)
+        await self._responder.finish(left_s)
         await tasks.within(STOP_STEP_TIMEOUT_S, self._polling.stop())
         await tasks.within(STOP_STEP_TIMEOUT_S, self._responder.end())
         await tasks.within(STOP_STEP_TIMEOUT_S, self._publish_end())

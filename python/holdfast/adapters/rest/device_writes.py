@@ -66,6 +66,8 @@ class DeviceWrites:
             async with self._opening:
                 self._calls = self._calls or await Calls.opened()
         calls = self._calls
+        if self._is_ending:
+            raise _withdrawn(begun)
         ticket = self._memory_access.call_device(begun, calls.caller)
         answer = calls.result(ticket)
         self._tickets.add(ticket)

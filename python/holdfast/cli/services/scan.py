@@ -284,7 +284,8 @@ async def _scan(
         elif reading is None and signals.take_reload():
             reading = FileWork(lambda: _has_changed(settings, known))
     await running
-    return scanner.stored_requests() if changed and not signals.received else None
+    # As a list: an iterator would keep the whole scanner.
+    return list(scanner.stored_requests()) if changed and not signals.received else None
 
 
 def _contents(settings: Settings) -> str:

@@ -18,20 +18,25 @@ export async function stream(path, options, onEvent) {
   }
   const reader = reply.body.pipeThrough(new TextDecoderStream()).getReader();
   let held = "";
-  for (;;) {
-    const { value, done } = await reader.read().catch((error) => {
-      if (error.name === "AbortError") throw error;
-      throw new Problem("gateway_gone", "the connection to the gateway ended");
-    });
-    if (done) return;
-    const events = (held + value).split("\n\n");
-    held = events.pop();
-    for (const event of events) {
-      if (event.startsWith(":")) continue;
-      const match = /^event: ([^\n]*)\ndata: ([^\n]*)$/.exec(event);
-      // The events after a lost one would be taken for something else.
-      if (!match) throw new Problem("internal_error", "the gateway sent an event that can't be read");
-      onEvent(match[1], JSON.parse(match[2]));
+  try {
+    for (;;) {
+      const { value, done } = await reader.read().catch((error) => {
+        if (error.name === "AbortError") throw error;
+        throw new Problem("gateway_gone", "the connection to the gateway ended");
+      });
+      if (done) return;
+      const events = (held + value).split("\n\n");
+      held = events.pop();
+      for (const event of events) {
+        if (event.startsWith(":")) continue;
+        const match = /^event: ([^\n]*)\ndata: ([^\n]*)$/.exec(event);
+        // The events after a lost one would be taken for something else.
+        if (!match) throw new Problem("internal_error", "the gateway sent an event that can't be read");
+        onEvent(match[1], JSON.parse(match[2]));
+      }
     }
+  } finally {
+    // Also after an event that can't be read: the gateway counts open streams.
+    reader.cancel().catch(() => {});
   }
 }

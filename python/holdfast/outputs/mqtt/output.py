@@ -45,6 +45,8 @@ class MqttOutput(BrokerReceiver):
         self._entities: dict[str, bytes] = {}
         self._found: deque[str] = deque()
         self._is_born = threading.Event()
+        self._has_sent = True
+        """Whether the broker has confirmed values since all were offered again."""
 
     def send(self, readings: list[Reading]) -> None:
         """Publishes readings, and waits until the broker has confirmed them.
@@ -61,7 +63,9 @@ class MqttOutput(BrokerReceiver):
             self._wait(session, delivery)
         except OSError:
             self._messages = self._messages[delivery.confirmed :]
+            self._has_sent |= delivery.confirmed > 0
             raise
+        self._has_sent = True
         self._payloads.settle(sent=True)
         self._taken, self._messages = [], ()
         self._publish_availability(session, answering=True)
@@ -101,7 +105,9 @@ class MqttOutput(BrokerReceiver):
         self._revision = -1
         self._entities = {}
         session.publish([self._availability.of_output(ONLINE)])
-        if self._connects > 1:
+        # A broker that ends each connection at once must not fill the buffer with repetitions.
+        if self._connects > 1 and self._has_sent:
+            self._has_sent = False
             self._site.refresh()
 
     def _keep_up(self, session: Session) -> None:

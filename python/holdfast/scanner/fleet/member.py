@@ -186,10 +186,13 @@ class FleetMember(Placement):
             await tasks.within(ADOPT_RETRY_S, self._has_touched.wait())
             self._has_touched.clear()
             touched, self._touched = self._touched, set()
-            if (now := time.monotonic()) >= retry_at:
-                touched |= self._refused
-                retry_at = now + ADOPT_RETRY_S
             await self._adopt_all(touched)
+            if time.monotonic() >= retry_at:
+                for device in tuple(self._refused):
+                    # Each may wait for a name server: what has changed comes first.
+                    if not self._has_touched.is_set():
+                        await self._adopt(device)
+                retry_at = time.monotonic() + ADOPT_RETRY_S
 
     async def _adopt_all(self, devices: Collection[str]) -> None:
         for device in devices:
