@@ -60,10 +60,7 @@ class Device:
         self._server.start()
         host, port = self._server.address
         self._address = f"{host}:{port}"
-
-    @property
-    def url(self) -> str:
-        return f"tcp://{self._address}"
+        self.url = f"tcp://{self._address}"
 
     def stop(self) -> None:
         if self._server is not None:
@@ -84,7 +81,7 @@ class Plant:
         self._running.callback(self.broker.kill)
         self.url = self.broker.url
         self.interval = 0.05
-        self.devices: dict[str, Device | Proxy] = {}
+        self.devices: dict[str, Device] = {}
         self.appliance: Appliance | None = None
 
     def __enter__(self) -> Self:
@@ -107,8 +104,9 @@ class Plant:
 
     def slow_device(self, name: str = "pump") -> Proxy:
         """The way to a device, which can hold back requests and replies."""
-        port = int(self.device(name).url.rpartition(":")[2])
-        made = self.devices[name] = Proxy(port, "tcp")
+        device = self.device(name)
+        made = Proxy(int(device.url.rpartition(":")[2]), "tcp")
+        device.url = made.url
         self._running.callback(made.close)
         return made
 
