@@ -1453,7 +1453,8 @@ def test_a_handler_that_does_not_raise_leaves_the_call_alone(make: Make) -> None
         with holdfast.SyncClient(device.url, timeout=LONG) as client:
             thread.start()
             assert client.read_holding_registers(7, 2) == [7, 8]
-        assert refused == ["this client is waiting for a reply: a signal handler can't use it"]
+        [why] = refused
+        assert why.startswith("this client is waiting for a reply")
     finally:
         thread.join()
         signal.signal(signal.SIGUSR1, before)
