@@ -26,7 +26,6 @@ import pytest
 
 import holdfast
 from holdfast._core import BlockingClient, Request
-from holdfast.cli.device_errors import maybe_written
 from holdfast.client import endpoint as endpoints
 from holdfast.client.requests import TooManyValues
 from holdfast.client.url import NetworkTarget, SerialTarget, Tls, Tolerance, parse
