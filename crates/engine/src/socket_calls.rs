@@ -13,7 +13,6 @@ use tokio::io::Interest;
 use tokio::net::TcpStream;
 
 /// Receives once. Returns the number of bytes, 0 at the end of the stream.
-#[cfg(target_os = "linux")]
 #[inline]
 pub(crate) fn poll_receive(
     socket: &TcpStream,
@@ -22,35 +21,30 @@ pub(crate) fn poll_receive(
 ) -> Poll<io::Result<usize>> {
     loop {
         ready!(socket.poll_read_ready(context))?;
-        let mut received = None;
-        let outcome = socket.try_io(Interest::READABLE, || {
-            let (len, _) = rustix::net::recv(socket, &mut *input, RecvFlags::empty())?;
-            received = Some(len);
-            // Less than there is room for was all there is. So it need not be asked for more before
-            // the system reports it.
-            if 0 < len && len < input.len() { Err(ErrorKind::WouldBlock.into()) } else { Ok(()) }
-        });
-        match (received, outcome) {
-            (Some(len), _) => return Poll::Ready(Ok(len)),
-            (None, Err(error)) if error.kind() == ErrorKind::WouldBlock => {}
-            (None, outcome) => return Poll::Ready(outcome.map(|()| 0)),
-        }
-    }
-}
-
-#[cfg(not(target_os = "linux"))]
-pub(crate) fn poll_receive(
-    socket: &TcpStream,
-    context: &mut Context<'_>,
-    input: &mut [u8],
-) -> Poll<io::Result<usize>> {
-    loop {
-        ready!(socket.poll_read_ready(context))?;
-        match socket.try_read(input) {
+        match receive(socket, input) {
             Err(error) if error.kind() == ErrorKind::WouldBlock => {}
             received => return Poll::Ready(received),
         }
     }
+}
+
+#[cfg(target_os = "linux")]
+#[inline]
+fn receive(socket: &TcpStream, input: &mut [u8]) -> io::Result<usize> {
+    let mut received = None;
+    let outcome = socket.try_io(Interest::READABLE, || {
+        let (len, _) = rustix::net::recv(socket, &mut *input, RecvFlags::empty())?;
+        received = Some(len);
+        // Less than there is room for was all there is. So it need not be asked for more before the
+        // system reports it.
+        if 0 < len && len < input.len() { Err(ErrorKind::WouldBlock.into()) } else { Ok(len) }
+    });
+    received.map_or(outcome, Ok)
+}
+
+#[cfg(not(target_os = "linux"))]
+fn receive(socket: &TcpStream, input: &mut [u8]) -> io::Result<usize> {
+    socket.try_read(input)
 }
 
 /// Sends once, without blocking. Returns the number of bytes that the system has accepted.

@@ -51,8 +51,6 @@ class DeviceWrites:
             if self._waiting[device] >= MAX_WAITING:
                 detail = f"{MAX_WAITING} writes wait for {device}, which is the limit"
                 raise Refused("busy", detail, **begun.where)
-            if self._is_ending:
-                raise _withdrawn(begun)
             self._waiting[device] += 1
             try:
                 return self._memory_access.answered(begun, await self._answer(request, begun))

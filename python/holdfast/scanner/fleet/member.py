@@ -188,10 +188,8 @@ class FleetMember(Placement):
             touched, self._touched = self._touched, set()
             await self._adopt_all(touched)
             if time.monotonic() >= retry_at:
-                for device in tuple(self._refused):
-                    # Each may wait for a name server: what has changed comes first.
-                    if not self._has_touched.is_set():
-                        await self._adopt(device)
+                # Together: each may wait for a name server, and what changes waits for all.
+                await asyncio.gather(*map(self._adopt, tuple(self._refused)))
                 retry_at = time.monotonic() + ADOPT_RETRY_S
 
     async def _adopt_all(self, devices: Collection[str]) -> None:
