@@ -1089,9 +1089,10 @@ class Connection:
         endpoint: Endpoint,
         event_loop: AbstractEventLoop,
         last: Connection | None = None,
+        trace: Callable[[str, bytes], object] | None = None,
     ) -> Connection:
         """A connection that follows the `last` one to this endpoint, which has ended: late replies
-        to requests of that one are recognized.
+        to requests of that one are recognized. `trace` is that of `BlockingClient`.
         """
 
     def opened(

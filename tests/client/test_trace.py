@@ -1,7 +1,8 @@
-"""The trace of `SyncClient`: the bytes that are sent and received."""
+"""The trace of a client: the bytes that are sent and received."""
 
 from __future__ import annotations
 
+import asyncio
 import sys
 import threading
 from typing import TYPE_CHECKING, Any
@@ -12,8 +13,12 @@ import holdfast
 from support import transports, wire
 from support.fake_device import FakeDevice, Stream, registers
 from support.running import endpoint
+from support.secured import Authority, Relay, context
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from holdfast.client.base import Trace
     from support.running import Run
 
 READ = bytes.fromhex("0000 0006 01 03 0007 0002")
@@ -128,3 +133,72 @@ def test_a_trace_within_a_call_of_another_trace_cannot_use_the_client_of_either(
         assert refused == ["sent", "sent", "received", "received"] * 2
         inner.close()
         outer.close()
+
+
+def read_twice(url: str, trace: Trace) -> None:
+    """Reads two registers twice with a client for asyncio."""
+
+    async def reading() -> None:
+        async with holdfast.Client(url, trace=trace) as plc:
+            assert await plc.read_holding_registers(7, 2) == [7, 8]
+            assert await plc.read_holding_registers(7, 2) == [7, 8]
+
+    asyncio.run(reading())
+
+
+def assert_two_reads(shown: Shown) -> None:
+    words, frames = zip(*shown.parts, strict=True)
+    assert words == ("sent", "received") * 2
+    reply = bytes.fromhex("0000 0007 01 03 04 0007 0008")
+    assert [frame[2:] for frame in frames] == [READ, reply] * 2
+
+
+def test_an_event_loop_shows_all_bytes_in_order() -> None:
+    shown = Shown()
+    with Stream("tcp") as device:
+        read_twice(device.url, shown)
+    assert_two_reads(shown)
+
+
+def test_an_event_loop_shows_what_is_inside_of_tls(tmp_path: Path) -> None:
+    authority, shown = Authority(tmp_path), Shown()
+    owner = authority.issue("plc", "IP:127.0.0.1")
+    with Stream("tcp") as device, Relay(("127.0.0.1", device.port), context(owner)) as relay:
+        read_twice(relay.url(ca=authority.ca), shown)
+    assert_two_reads(shown)
+
+
+def test_a_client_for_asyncio_shows_the_bytes_of_other_transports() -> None:
+    shown = Shown()
+    with Stream("rtu+tcp") as device:
+        read_twice(device.url, shown)
+    assert [word for word, _ in shown.parts] == ["sent", "received"] * 2
+
+
+@pytest.mark.parametrize("at", ["sent", "received"])
+def test_an_error_in_the_trace_ends_nothing_in_an_event_loop(
+    at: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reported: list[Any] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda found: reported.append(found.exc_value))
+
+    def trace(direction: str, _data: bytes) -> None:
+        if direction == at:
+            raise ValueError(direction)
+
+    with Stream("tcp") as device:
+        read_twice(device.url, trace)
+    assert [str(each) for each in reported] == [at, at]
+
+
+@pytest.mark.parametrize("at", ["sent", "received"])
+def test_an_interrupt_in_the_trace_ends_the_event_loop(at: str) -> None:
+    interrupts = [KeyboardInterrupt]
+
+    def trace(direction: str, _data: bytes) -> None:
+        if direction == at and interrupts:
+            raise interrupts.pop()
+
+    with Stream("tcp") as device, pytest.raises(KeyboardInterrupt):
+        read_twice(device.url, trace)
+    assert not interrupts

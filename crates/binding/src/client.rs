@@ -438,7 +438,7 @@ impl BlockingClient {
 
 /// Shows bytes to a function of Python. Its errors are only reported, because the device may have carried
 /// out the request. Returns what else it raised: `KeyboardInterrupt`, for example.
-fn show(trace: &Py<PyAny>, direction: Direction, bytes: &[u8]) -> Option<PyErr> {
+pub fn show(trace: &Py<PyAny>, direction: Direction, bytes: &[u8]) -> Option<PyErr> {
     let word = match direction {
         Direction::Sent => "sent",
         Direction::Received => "received",

@@ -7,7 +7,7 @@ use std::io;
 use std::sync::Mutex;
 use std::time::Duration;
 
-use holdfast_engine::client::{ClientError, Lost, Place};
+use holdfast_engine::client::{ClientError, Direction, Lost, Place};
 use holdfast_engine::tls::TlsFailure;
 use holdfast_protocol::client::{
     Attempt as CoreAttempt, Closed, Connection as Core, Done, Failure, Ticket, Transport,
@@ -20,7 +20,7 @@ use pyo3::{PyTraverseError, PyVisit, intern};
 
 use crate::arguments::{byte, seconds};
 use crate::channel::Tls;
-use crate::client::{Endpoint, Request, exception, raised, value};
+use crate::client::{Endpoint, Request, exception, raised, show, value};
 use crate::memory::Integer;
 
 /// No call into Python is made while its state is locked, but for those that make objects: the callee could
@@ -35,6 +35,8 @@ pub struct Connection {
     time: Py<PyAny>,
     /// Received bytes, until they are processed.
     buffer: Py<PyByteArray>,
+    /// What is called with the bytes that are sent and received.
+    trace: Option<Py<PyAny>>,
 }
 
 /// The bytes that are received at once: seven of the longest replies.
@@ -92,11 +94,12 @@ enum Ending {
 #[pymethods]
 impl Connection {
     #[new]
-    #[pyo3(signature = (endpoint, event_loop, last=None))]
+    #[pyo3(signature = (endpoint, event_loop, last=None, trace=None))]
     fn new(
         endpoint: PyRef<'_, Endpoint>,
         event_loop: &Bound<'_, PyAny>,
         last: Option<PyRef<'_, Connection>>,
+        trace: Option<Py<PyAny>>,
     ) -> PyResult<Connection> {
         let Place::Tcp { tls, .. } = &endpoint.core.place else {
             return Err(PyValueError::new_err("endpoint is not one of TCP or TLS"));
@@ -128,7 +131,7 @@ impl Connection {
         let create_future = event_loop.getattr("create_future")?.unbind();
         let (time, state) = (time.unbind(), Mutex::new(state));
         let buffer = PyByteArray::new(event_loop.py(), &[0; BUFFER_LEN]);
-        Ok(Connection { state, to, create_future, time, buffer: buffer.unbind() })
+        Ok(Connection { state, to, create_future, time, buffer: buffer.unbind(), trace })
     }
 
     /// Takes the methods of the owner of the socket.
@@ -215,11 +218,13 @@ impl Connection {
         let mut state = lock(&self.state);
         state.flushes = false;
         let write = state.owner.as_ref().map(|owner| owner.write.clone_ref(py));
-        if let Some((write, outgoing)) = write.zip(state.outgoing(py)) {
-            drop(state);
-            write.call1(py, (outgoing,))?;
-        }
-        Ok(())
+        let traced = self.trace.as_ref().map(|_| state.core.outgoing().to_vec());
+        let Some((write, outgoing)) = write.zip(state.outgoing(py)) else { return Ok(()) };
+        drop(state);
+        // What it raises ends nothing: the bytes are sent all the same.
+        let raised = self.show(Direction::Sent, &traced.unwrap_or_default());
+        write.call1(py, (outgoing,))?;
+        raised
     }
 
     /// Where the loop puts received bytes.
@@ -256,9 +261,14 @@ impl Connection {
         let has_changed = was_handshaking || state.core.closed().is_some();
         let owner = state.owner.as_ref().filter(|_| has_changed);
         let changed = owner.map(|owner| owner.changed.clone_ref(py));
+        let plain = self.trace.as_ref().and(state.tls.as_ref()).map(|tls| tls.plain.clone());
         drop(state);
+        let raised = self.show(Direction::Received, plain.as_deref().unwrap_or(data));
         settle(py, completed)?;
-        changed.map_or(Ok(()), |changed| changed.call0(py).map(|_| ()))
+        if let Some(changed) = changed {
+            changed.call0(py)?;
+        }
+        raised
     }
 
     /// Ends the requests whose timeout has expired. When to call it again; `None` for no request.
@@ -343,6 +353,9 @@ impl Connection {
     fn __traverse__(&self, visit: PyVisit<'_>) -> Result<(), PyTraverseError> {
         visit.call(&self.create_future)?;
         visit.call(&self.time)?;
+        if let Some(trace) = &self.trace {
+            visit.call(trace)?;
+        }
         // What a locked state has is in use.
         let Ok(state) = self.state.try_lock() else { return Ok(()) };
         for (_, future) in &state.waiting {
@@ -389,6 +402,12 @@ impl State {
 }
 
 impl Connection {
+    /// Shows bytes to the trace. An error is what it raised that is no `Exception`.
+    fn show(&self, direction: Direction, bytes: &[u8]) -> PyResult<()> {
+        let trace = self.trace.as_ref().filter(|_| !bytes.is_empty());
+        trace.and_then(|trace| show(trace, direction, bytes)).map_or(Ok(()), Err)
+    }
+
     /// Collects what `work` completes.
     fn complete(
         &self,

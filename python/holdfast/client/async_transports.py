@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from holdfast._core import Endpoint, Request
+    from holdfast.client.base import Trace
     from holdfast.client.url import NetworkTarget, Target
 
 CLOSED = "connection lost: closed by this side"
@@ -63,13 +64,14 @@ class AsyncTransport(Protocol):
 class ThreadedConnection:
     """A transport with one request at a time, in a thread of its own."""
 
-    def __init__(self, target: Target) -> None:
+    def __init__(self, target: Target, trace: Trace | None = None) -> None:
         self._endpoint = endpoint(target)
+        self._trace = trace
         self._connect_anew()
         renew_in_children(self, ThreadedConnection._connect_anew)
 
     def _connect_anew(self) -> None:
-        self._core = BlockingClient(self._endpoint)
+        self._core = BlockingClient(self._endpoint, self._trace)
         self._executor: ThreadPoolExecutor | None = None
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
@@ -118,9 +120,16 @@ class ThreadedConnection:
 class AsyncConnection:
     """The connection of a client over TCP or TLS, in one event loop at a time."""
 
-    def __init__(self, target: NetworkTarget, endpoint: Endpoint, max_in_flight: int) -> None:
+    def __init__(
+        self,
+        target: NetworkTarget,
+        endpoint: Endpoint,
+        max_in_flight: int,
+        trace: Trace | None = None,
+    ) -> None:
         self._target = target
         self._endpoint = endpoint
+        self._trace = trace
         self._max_in_flight = 1 if target.tolerance.is_one_at_a_time else max_in_flight
         self._connect_anew()
         renew_in_children(self, AsyncConnection._connect_anew)
@@ -217,7 +226,9 @@ class AsyncConnection:
         # An object for each loop: calls that a closed loop has left behind may end at any time,
         # and must not give back places of the new one.
         late = (0, 0.0) if last is None else (last.late, last.longest_late)
-        here = _LoopConnection(self._target, self._endpoint, self._max_in_flight, loop, *late)
+        here = _LoopConnection(
+            self._target, self._endpoint, self._max_in_flight, self._trace, loop, *late
+        )
         self._last = here
         sleep_at_end(loop)
         return here
@@ -231,6 +242,7 @@ class _LoopConnection:
         target: NetworkTarget,
         endpoint: Endpoint,
         max_in_flight: int,
+        trace: Trace | None,
         loop: asyncio.AbstractEventLoop,
         late: int,
         longest_late: float,
@@ -248,6 +260,7 @@ class _LoopConnection:
         self._max_in_flight = max_in_flight
         self._target = target
         self._endpoint = endpoint
+        self._trace = trace
         self._kind = _Buffered if isinstance(loop, asyncio.BaseEventLoop) else _Streamed
         self._late_before = late
         self._longest_late_before = longest_late
@@ -350,7 +363,7 @@ class _LoopConnection:
         self._is_looking_up = False
         if self._connect_at > self.loop.time():
             await asyncio.sleep(self._connect_at - self.loop.time())
-        self._newest = core = Connection(self._endpoint, self.loop, self._newest)
+        self._newest = core = Connection(self._endpoint, self.loop, self._newest, self._trace)
         protocol = self._kind(self, core)
         deadline = self.loop.time() + timeout
         try:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeAlias
 
 from holdfast.client.url import SerialTarget, parse
 from holdfast.protocol import BROADCAST_CODES, MAX_UNIT
@@ -11,6 +12,9 @@ from holdfast.values.integers import as_integer
 if TYPE_CHECKING:
     from holdfast._core import Request
     from holdfast.client.url import Target
+
+Trace: TypeAlias = Callable[[str, bytes], object]
+"""What is called with `"sent"` or `"received"`, and the bytes."""
 
 DEFAULT_TIMEOUT_S = 1.0
 """Seconds for a request and its reply, of clients and of devices that are polled."""

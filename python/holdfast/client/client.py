@@ -14,24 +14,26 @@ from holdfast.values.integers import as_integer
 
 if TYPE_CHECKING:
     from holdfast.client.async_transports import AsyncTransport
+    from holdfast.client.base import Trace
     from holdfast.client.url import Target
 
 
-def connection(target: Target, max_in_flight: int) -> AsyncTransport:
+def connection(target: Target, max_in_flight: int, trace: Trace | None = None) -> AsyncTransport:
     """The connection to a device, for asyncio. It connects on its first call."""
     if isinstance(target, NetworkTarget) and target.transport in IN_FLIGHT:
-        return AsyncConnection(target, endpoint(target), max_in_flight)
-    return ThreadedConnection(target)
+        return AsyncConnection(target, endpoint(target), max_in_flight, trace)
+    return ThreadedConnection(target, trace)
 
 
 class Client(AsyncOperations):
     """A client for asyncio. Await every method.
 
-    `url`, `unit` and `timeout` are those of `SyncClient`, and so are the errors. Over TCP and TLS
-    up to `max_in_flight` requests are on their way at once, and replies may come in any order; what
-    is more waits for its turn, which `timeout` does not cover. More than 1 is faster where a device
-    accepts it; many drop requests that overlap. Each reply starts the timeouts of later requests
-    again. On other transports one request is on its way at once.
+    `url`, `unit`, `timeout` and `trace` are those of `SyncClient`, and so are the errors. Over TCP
+    and TLS up to `max_in_flight` requests are on their way at once, and replies may come in any
+    order; what is more waits for its turn, which `timeout` does not cover. More than 1 is faster
+    where a device accepts it; many drop requests that overlap. Each reply starts the timeouts of
+    later requests again. On other transports one request is on its way at once, and a thread of the
+    client calls `trace`.
 
     Any number of tasks can share a client in one event loop. To use it in another loop, first
     `close` it or close the first loop. After a cancelled call, the connection remains usable.
@@ -42,13 +44,19 @@ class Client(AsyncOperations):
     """
 
     def __init__(
-        self, url: str, *, unit: int = 1, timeout: float = DEFAULT_TIMEOUT_S, max_in_flight: int = 1
+        self,
+        url: str,
+        *,
+        unit: int = 1,
+        timeout: float = DEFAULT_TIMEOUT_S,
+        max_in_flight: int = 1,
+        trace: Trace | None = None,
     ) -> None:
         super().__init__(url, unit, timeout)
         most = as_integer(max_in_flight)
         if most is None or not 1 <= most <= MAX_IN_FLIGHT:
             raise ValueError(f"max_in_flight is {max_in_flight!r}, allowed: 1 to {MAX_IN_FLIGHT}")
-        self._transport = connection(self.target, most)
+        self._transport = connection(self.target, most, trace)
 
     async def close(self) -> None:
         """Closes the connection: pending calls raise `ConnectionLost`, a later call reconnects."""

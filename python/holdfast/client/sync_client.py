@@ -11,7 +11,7 @@ from holdfast.client.fork import renew_in_children
 from holdfast.client.sync_operations import SyncOperations
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from holdfast.client.base import Trace
 
 
 class SyncClient(SyncOperations):
@@ -48,7 +48,7 @@ class SyncClient(SyncOperations):
         *,
         unit: int = 1,
         timeout: float = DEFAULT_TIMEOUT_S,
-        trace: Callable[[str, bytes], object] | None = None,
+        trace: Trace | None = None,
     ) -> None:
         super().__init__(url, unit, timeout)
         self._endpoint = endpoint(self.target)
