@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import NoRespondersError
 
+from holdfast.config import load
 from holdfast.events import log_lines
 from support import web, wire
 from support.brokers import NatsServer, free_port
@@ -74,7 +75,7 @@ def status(appliance: Appliance, name: str) -> dict[str, Any]:
 
 
 def until_connected(appliance: Appliance) -> None:
-    wire.until(lambda: status(appliance, "nats")["connected"], "the scanner is connected")
+    wire.until(lambda: status(appliance, "nats").get("connected"), "the scanner is connected")
 
 
 def ask(appliance: Appliance, path: str, body: Any, secret: str | None = None) -> web.Answer:
@@ -233,6 +234,48 @@ def test_devices_are_polled_for_subscribers(
     assert (told["state"], told["connected"], told["devices"]) == ("running", True, 1)
     assert (told["servers"], told["prefix"]) == ([nats.url], "plant")
     assert 'holdfast_adapter_status{adapter="nats",field="devices"} 1.0' in scraped(appliance)
+
+
+def test_after_a_reload_subscriptions_go_on(
+    run: Run,
+    nats: NatsServer,
+    caller: Caller,
+    server: holdfast.Server,
+    tmp_path: Path,
+    log: web.Records,
+) -> None:
+    def reload(text: str) -> None:
+        (tmp_path / "appliance.yaml").write_text(text)
+        assert appliance.reload(load(tmp_path / "appliance.yaml")) == ["nats"]
+        until_connected(appliance)
+
+    text = nats_section(nats.url) + "  keep_subscriptions: false\n"
+    appliance = run(text)
+    data = caller.listen("plant.data.plc1")
+    assert subscribed(caller, server)["success"] is True
+    data.next()
+    reload(text + "  limits: {tags: 7}\n")
+    assert caller.request("plant.browse", b"")["count"] == 1
+    data.take()
+    data.next()
+    [restored] = log.of("restored")
+    assert (restored["device"], restored["tags"]) == ("plc1", 1)
+
+    # One that its files keep from starting loses nothing.
+    (tmp_path / "ca.pem").write_text("no certificate")
+    unusable = text + "  device_tls: {ca_file: ca.pem}\n"
+    (tmp_path / "appliance.yaml").write_text(unusable)
+    appliance.reload(load(tmp_path / "appliance.yaml"))
+    wire.until(lambda: log.of("adapter_failed"), "it has failed")
+    reload(text)
+    assert caller.request("plant.browse", b"")["count"] == 1
+
+    reload(text.replace("plant", "other"))
+    assert caller.request("other.browse", b"")["count"] == 0
+    caller.publish("other.shutdown")
+    wire.until(lambda: log.of("adapter_stopped"), "the scanner has ended")
+    reload(text.replace("plant", "other") + "  limits: {tags: 7}\n")
+    assert caller.request("other.browse", b"")["count"] == 0
 
 
 def test_devices_outside_the_list_are_not_polled(

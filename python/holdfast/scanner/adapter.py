@@ -13,9 +13,12 @@ from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.service import Scanner
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from holdfast._core import Poller
     from holdfast.replication.leases.thread import StartThread
     from holdfast.runtime.stop import Stop
+    from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.settings import Settings
 
 
@@ -24,7 +27,8 @@ class ScannerAdapter:
 
     It returns when a shutdown message arrives. The URLs in `settings.servers` must not contain
     secrets, because `status` shows them. Devices are polled by `poller`, if it is given; no other
-    scanner may use it then. The thread of leases is started by `start_thread`.
+    scanner may use it then. The thread of leases is started by `start_thread`. It begins with the
+    subscriptions of a `former` scanner.
     """
 
     def __init__(
@@ -32,10 +36,13 @@ class ScannerAdapter:
         settings: Settings,
         poller: Poller | None = None,
         start_thread: StartThread = threading.Thread.start,
+        former: Iterable[SubscribeRequest] = (),
     ) -> None:
         self._settings = settings
-        self._scanner = Scanner(settings, poller, start_thread)
+        self._scanner = Scanner(settings, poller, start_thread, former)
         self.heartbeat = Heartbeat()
+        self.subscriptions: list[SubscribeRequest] = []
+        """Requests that make its subscriptions, after its end; none after a shutdown message."""
 
     def run(self, stop: Stop) -> None:
         """Serves until `stop` is set, or until a shutdown message.
@@ -53,7 +60,12 @@ class ScannerAdapter:
 
         stop.then(end)
         async with tasks.beating(self.heartbeat):
-            await self._scanner.run()
+            try:
+                await self._scanner.run()
+            finally:
+                # After a failure, only what was not restored: the cause may be among the others.
+                left = self._scanner.stored_requests() if stop.is_set() else self._scanner.former
+                self.subscriptions = list(left)
 
     def status(self) -> dict[str, object]:
         """Returns the state of the connection, the number of devices, and counts of messages."""

@@ -67,7 +67,8 @@ class Scanner:
         It begins with the subscriptions of a `former` scanner: its `stored_requests`.
         """
         self._settings = settings
-        self._former = former
+        self.former = former
+        """What it begins with, until that is restored."""
         self._ended = asyncio.Event()
         self._ready = asyncio.Event()
         """Set when the stored subscriptions are restored, or can't be."""
@@ -169,7 +170,7 @@ class Scanner:
             log_lines.LOGGER.removeHandler(log_mirror)
 
     async def _restore_former(self) -> None:
-        former, self._former = self._former, ()
+        former, self.former = self.former, ()
         if self._settings.fleet is None:  # A fleet has stored all of them.
             await asyncio.gather(*map(self._restore, former))
 
@@ -184,6 +185,7 @@ class Scanner:
 
     def stored_requests(self) -> Iterator[SubscribeRequest]:
         """Yields requests that make the subscriptions, except those from entries of a bucket."""
+        yield from self.former
         for device in self._registry.devices.values():
             for subscriber in device.subscribers:
                 if not self._requests.is_entry(device.id, subscriber):

@@ -15,11 +15,17 @@ if TYPE_CHECKING:
     from holdfast.config import Config
     from holdfast.config.models.services import NatsConfig
     from holdfast.config.models.tags import ProfileConfig
+    from holdfast.scanner.adapter import ScannerAdapter
+    from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.settings import Settings
 
 
 class ScannerService(Service):
     """The service of the section `nats`."""
+
+    def __init__(self) -> None:
+        self._former: tuple[ScannerAdapter, Settings] | None = None
+        """The last scanner: one that takes its place begins with its subscriptions."""
 
     def adapters(self, config: Config, running: Services) -> Iterator[Supervisor]:
         """Yields the adapter, if configured."""
@@ -29,9 +35,21 @@ class ScannerService(Service):
 
         settings = scanner_settings(config.nats, config.profiles)
         starter, poller = Starter(), running.context.devices.poller
+
+        def adapter() -> ScannerAdapter:
+            former: list[SubscribeRequest] = []
+            if self._former is not None:
+                before, of = self._former
+                # Subscribers of another prefix don't know where values have gone.
+                if (of.prefix, of.dialect) == (settings.prefix, settings.dialect):
+                    former = before.subscriptions
+            made = ScannerAdapter(settings, poller, starter.start, former)
+            self._former = made, settings
+            return made
+
         yield Supervisor(
             "nats",
-            lambda: ScannerAdapter(settings, poller, starter.start),
+            adapter,
             config.nats,
             config.profiles,
             may_end=True,
