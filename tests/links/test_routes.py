@@ -744,6 +744,7 @@ def test_a_write_under_way_is_recorded_although_its_client_has_gone(
     if is_ended:
         [session] = appliance.sessions()
         assert appliance.end_session("scada", session["id"], {})
+        assert gone.rest() == b""
     else:
         gone.reset()
     await_nobody(appliance)

@@ -78,8 +78,9 @@ pub(crate) trait Renewal: Send + Sync {
 }
 
 pub(crate) struct Connection<F: Framing, S> {
-    stream: S,
+    /// Before the stream: once the peer can see the end, none of its requests that wait is sent any more.
     answering: Answering<F>,
+    stream: S,
     deadlines: Deadlines,
     renewal: Arc<dyn Renewal>,
     ticket: Ticket,
