@@ -258,10 +258,11 @@ impl Reply {
         }
     }
 
-    /// The request is sent now.
-    pub(super) fn note_sent(&self) {
-        if let Receiver::EventLoop(to) = &self.to {
-            to.note_sent();
+    /// Its turn has come. Returns whether it is still wanted.
+    pub(super) fn is_next(&self) -> bool {
+        match &self.to {
+            Receiver::Listener(to, _) => !to.is_unwanted(),
+            Receiver::EventLoop(to) => to.note_sent(),
         }
     }
 }

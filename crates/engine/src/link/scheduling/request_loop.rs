@@ -75,9 +75,13 @@ impl Serving {
             return counters.withdrawn.add();
         }
         // Requests before this one may have opened a breaker while it waited.
-        let replies = self.admitted(unit_id, &request, replies, counters);
+        let mut replies = self.admitted(unit_id, &request, replies, counters);
         let Some(timeout) = replies.iter().map(Reply::timeout).max() else { return };
-        replies.iter().for_each(Reply::note_sent);
+        // Who has given up until now was told that nothing is sent.
+        replies.retain(Reply::is_next);
+        if replies.is_empty() {
+            return counters.withdrawn.add();
+        }
         let changes = self.link.changes.get();
         let answered =
             self.link.exchange(unit_id, &request, timeout, true, &Permit::default()).await;
