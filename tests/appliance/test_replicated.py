@@ -464,6 +464,47 @@ def test_the_past_can_be_rebuilt(
     assert server.url
 
 
+def test_a_larger_memory_begins_a_new_log_with_the_values_of_the_old_one(
+    node: Callable[..., Appliance], tmp_path: Path, server: NatsServer
+) -> None:
+    one = node("a", files={4: 2})
+    ask(one, "060003002a")
+    ask(one, "05000cff00")
+    one.memories["plant"].write("file:4", 1, [7])
+    one.stop()
+    values = tmp_path / "plant.csv"
+    done("log", "replay", str(tmp_path / "a.yaml"), "--output", str(values))
+    config(tmp_path, [server.url], holding_registers=200, files={4: 9}, initial="plant.csv")
+    file = tmp_path / "a.yaml"
+    file.write_text(file.read_text().replace("site", "larger"))
+    with Appliance(load(file)) as larger:
+        assert ask(larger, "0300030001") == "0302002a"
+        assert ask(larger, "01000c0001") == "010101"
+        assert larger.memories["plant"].read("file:4", 0, 9) == [0, 7, *[0] * 7]
+        assert ask(larger, "0600c70001") == "0600c70001"
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--output", "x.csv"], "the log has several memories, add --memory: plant, more"),
+        (["--output", "x.csv", "--memory", "mor"], "no memory 'mor', allowed: plant, more; did"),
+        (["--output", "x.json"], "found x.json, allowed: a file with one of .csv, .yaml, .yml"),
+        (["--output", "x.csv", "--follow"], "--follow and --output can't be used together"),
+        (["--memory", "plant"], "--memory is for --output"),
+    ],
+    ids=["several", "unknown", "kind", "follow", "alone"],
+)
+def test_a_replay_writes_one_memory(tmp_path: Path, options: list[str], told: str) -> None:
+    file = tmp_path / "a.yaml"
+    file.write_text(
+        "memories: {plant: &memory {coils: 8, replicate: {log: site}}, more: *memory}\n"
+        "logs: {site: {servers: ['nats://127.0.0.1:1'], node: a}}\n"
+        "rest: {bind: 127.0.0.1:0, sources: [127.0.0.1], tokens: none}\n"
+    )
+    assert told in usage_error("log", "replay", str(file), *options)
+
+
 def test_a_replay_to_behind_the_end_of_the_log_says_so(
     node: Callable[..., Appliance], tmp_path: Path
 ) -> None:

@@ -17,11 +17,20 @@ from holdfast.appliance.nats_servers import nats_servers
 from holdfast.appliance.parts import log_servers
 from holdfast.appliance.parts.memories import empty
 from holdfast.appliance.parts.shared_logs import credentials, servers
+from holdfast.cli.appliance import memory_file
+from holdfast.cli.appliance.memory_file import KeptArea
 from holdfast.cli.configuration import load_or_exit
 from holdfast.cli.exit_codes import fail
 from holdfast.cli.options.bind_and_source import bind_option, unbindable
 from holdfast.cli.options.logs import chosen_log, log_option
-from holdfast.cli.options.option import config_argument, flag, json_option, option
+from holdfast.cli.options.option import (
+    config_argument,
+    file_option,
+    flag,
+    json_option,
+    option,
+    require_known,
+)
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.terminal_text import print_json
 from holdfast.events import log_lines
@@ -53,6 +62,10 @@ MAX_TIME_NS = 2**63 - 1
 )
 @flag("--follow", "Print each step, also those to come.")
 @flag("--values", "Print all values that are not 0.")
+@file_option(
+    "--output", "Write the values of a memory to a .csv, .yaml or .yml file, as `initial`."
+)
+@option("--memory", "NAME", "The memory of --output. Required if there are several.")
 @bind_option(None, "Serve the memories here, read-only, as units 1, 2, …, to this machine.")
 @json_option
 def replay(
@@ -61,6 +74,8 @@ def replay(
     to: str | None,
     follow: bool,
     values: bool,
+    output: Path | None,
+    memory: str | None,
     bind: Bind | None,
     as_json: bool,
 ) -> None:
@@ -73,6 +88,10 @@ def replay(
         raise click.UsageError(f"--bind {bind}: a replay is only served to this machine.")
     if follow and to is not None:
         raise click.UsageError("--follow and --to can't be used together.")
+    if follow and output is not None:
+        raise click.UsageError("--follow and --output can't be used together.")
+    if memory is not None and output is None:
+        raise click.UsageError("--memory is for --output.")
     config = load_or_exit(file)
     log = chosen_log(config, name)
     settings = config.logs[log]
@@ -83,6 +102,7 @@ def replay(
     ]
     if not memories:
         raise click.UsageError(f"no memory is replicated through the log {log}.")
+    chosen = None if output is None else _chosen(dict(memories), memory, output)
     signals = Signals()
     with ExitStack() as running:
         try:
@@ -125,8 +145,26 @@ def replay(
             shown = nats_servers(settings).shown
             where = f" (servers: {shown})" if isinstance(error, _core.LogError) else ""
             fail(f"logs.{log}: {error}{where}", reason="connection" if where else "failed")
+    if chosen is not None and output is not None:
+        areas = {
+            area: KeptArea(addresses.start, chosen.read(area, addresses.start, len(addresses)))
+            for area, addresses in _areas_and_files(chosen)
+        }
+        text = memory_file.written(areas, memory_file.kind_of(output), zeros=False)
+        memory_file.write(output, text)
     if bind is not None and not signals.received:
         _serve(memories, bind, signals, as_json=as_json)
+
+
+def _chosen(memories: dict[str, _core.Memory], name: str | None, output: Path) -> _core.Memory:
+    """The memory whose values are written."""
+    memory_file.kind_of(output)
+    if name is None and len(memories) > 1:
+        raise click.UsageError(f"the log has several memories, add --memory: {listing(memories)}")
+    if name is None:
+        return next(iter(memories.values()))
+    require_known(name, memories, "the log has no memory", "memories")
+    return memories[name]
 
 
 def _passes(error: _core.LogError) -> bool:
@@ -213,10 +251,10 @@ def _tell(
         click.echo(f"{name} {area} {address}: {value}")
 
 
-def _areas_and_files(memory: _core.Memory) -> Iterator[tuple[str, range]]:
+def _areas_and_files(memory: _core.Memory) -> Iterator[tuple[Any, range]]:
     yield from memory.areas.items()
     for number, records in memory.files.items():
-        yield f"file:{number}", range(records)
+        yield f"{memory_file.FILE}{number}", range(records)
 
 
 def _line(file: Path, record: LogRecord, *, as_json: bool) -> str:

@@ -21,7 +21,7 @@ from holdfast.cli.options.option import (
 )
 from holdfast.cli.terminal_text import print_json
 from holdfast.config import ConfigError
-from holdfast.config.initial_values import KINDS, parse, read
+from holdfast.config.initial_values import parse, read
 from holdfast.runtime.text import listing
 
 if TYPE_CHECKING:
@@ -65,18 +65,14 @@ def verify(file: Path, as_json: bool) -> None:
 @flag("--set-aside", "Print the values at addresses that were cut instead.")
 def export(file: Path, name: str | None, output: Path | None, zeros: bool, set_aside: bool) -> None:
     """Print the values of a memory in FILE, in the format of `initial`."""
-    kind = ".csv" if output is None else _kind(output)
+    kind = ".csv" if output is None else memory_file.kind_of(output)
     found = _contents(file, set_aside=set_aside)
     areas = {} if set_aside and not found else _chosen(found, name, file)
-    lines = memory_file.csv_lines if kind == ".csv" else memory_file.yaml_lines
-    text = "".join(f"{line}\n" for line in lines(areas, zeros=zeros))
+    text = memory_file.written(areas, kind, zeros=zeros)
     if output is None:
         click.echo(text, nl=False)
-        return
-    try:
-        output.write_text(text, encoding="utf-8")
-    except OSError as error:
-        fail(f"{output}: {error.strerror or error}", ExitCode.WRONG)
+    else:
+        memory_file.write(output, text)
 
 
 @memory.command("import", epilog="Example: holdfast memory import setpoints.redb setpoints.csv")
@@ -89,7 +85,7 @@ def import_(file: Path, values: Path, name: str | None, merge: bool) -> None:
 
     VALUES is a .csv or .yaml file in the format of `initial`. It is checked completely first.
     """
-    _kind(values)
+    memory_file.kind_of(values)
     found = _contents(file)
     areas = _chosen(found, name, file)
     try:
@@ -164,10 +160,3 @@ def _chosen(
         raise click.UsageError(f"{file} has several memories, add --memory: {listing(found)}")
     require_known(name, found, f"{file} has no memory", "memories")
     return found[name]
-
-
-def _kind(file: Path) -> str:
-    kind = file.suffix.lower()
-    if kind not in KINDS:
-        raise click.UsageError(f"found {file.name}, allowed: a file with one of {listing(KINDS)}")
-    return kind

@@ -1,10 +1,17 @@
-"""Reads and changes files that keep memories, while no appliance uses them."""
+"""Files of memories: reads and changes those that keep them, while no appliance uses them, and
+writes those of `initial`.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import click
+
 from holdfast import _core
+from holdfast.cli.exit_codes import ExitCode, fail
+from holdfast.config.initial_values import KINDS
+from holdfast.runtime.text import listing
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -81,7 +88,29 @@ def release(file: Path, memory: str) -> None:
     _core.release_memory_file(str(file), memory)
 
 
-def csv_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
+def kind_of(file: Path) -> str:
+    """The suffix of a file of `initial`. Raises `click.UsageError` for another one."""
+    kind = file.suffix.lower()
+    if kind not in KINDS:
+        raise click.UsageError(f"found {file.name}, allowed: a file with one of {listing(KINDS)}")
+    return kind
+
+
+def written(areas: Mapping[Area, KeptArea], kind: str, *, zeros: bool) -> str:
+    """The values as text in the format of `initial`."""
+    lines = _csv_lines if kind == ".csv" else _yaml_lines
+    return "".join(f"{line}\n" for line in lines(areas, zeros=zeros))
+
+
+def write(file: Path, text: str) -> None:
+    """Writes a file, or ends the program."""
+    try:
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        fail(f"{file}: {error.strerror or error}", ExitCode.WRONG)
+
+
+def _csv_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
     """Lines of area,address,value; those with the value 0 only with `zeros`."""
     yield "area,address,value"
     for area, kept in areas.items():
@@ -90,7 +119,7 @@ def csv_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
                 yield f"{area},{address},{value}"
 
 
-def yaml_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
+def _yaml_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
     """Areas with runs of values: `ADDRESS: [VALUE, …]`."""
     for area, kept in areas.items():
         yield f"{area}:" if any(kept.values) or zeros else f"{area}: {{}}"
