@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 Rounding: TypeAlias = Literal["nearest", "exact"]
 """What happens to a value between two values of the registers: rounded, or refused."""
 
+ROUNDING_OF_WRITES: Rounding = "exact"
+ROUNDING_OF_MESSAGES: Rounding = "nearest"
+"""Those of tags without `round`. A published measurement has more digits than registers; a value
+that somebody sets is meant as it stands.
+"""
+
 
 class WritableTag(ScaledTag):
     """A tag as writes see it."""
@@ -53,7 +59,7 @@ class WritableTag(ScaledTag):
         assert isinstance(self.scale, RegisterScale)
         return f"the scale is in {self.scale.where}, which has to be read first"
 
-    def raw(self, value: Any, *, default_round: Rounding = "exact") -> Any:
+    def raw(self, value: Any, *, default_round: Rounding = ROUNDING_OF_WRITES) -> Any:
         """What the registers have to hold for a value, or for the name of one.
 
         Raises `DoesNotFit` for a value that they can't hold, and for one below `min` or above

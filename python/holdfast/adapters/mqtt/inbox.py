@@ -18,6 +18,7 @@ from holdfast.ingest import Grant, Refused
 from holdfast.ingest.refusals import MAX_SHOWN
 from holdfast.runtime.text import clip
 from holdfast.tags.text import value_from
+from holdfast.tags.writing import ROUNDING_OF_MESSAGES
 from holdfast.values import ConversionError, codec_for
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ class Value:
                 raise ValueError(f"{len(payload)} bytes, allowed: {MAX_BYTES}")
             text = bytes(payload).decode()
             value = value_from(self._tag, text)
-            values = self._codec.encode(self._tag.raw(value, default_round="nearest"))
+            values = self._codec.encode(self._tag.raw(value, default_round=ROUNDING_OF_MESSAGES))
         except UnicodeDecodeError:
             raise self._bad(payload, "the payload is not UTF-8") from None
         except (ConversionError, ValueError, TypeError, OverflowError) as error:

@@ -1,4 +1,4 @@
-"""The endpoint for diagnostics, and which of its sub-functions are writes."""
+"""The endpoint for diagnostics."""
 
 from __future__ import annotations
 
