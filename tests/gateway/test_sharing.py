@@ -111,6 +111,13 @@ def test_single_writes_take_the_functions_for_several_where_the_device_needs_it(
     assert [asked.pdu[0] for asked in device.requests] == [16, 15, 3]
 
 
+def test_a_silent_device_is_waited_for_no_longer_than_by_clients_of_the_link(run: Run) -> None:
+    with Stream("tcp", then=silent) as device:
+        appliance = run(with_gateway(device.url, link={"timeout": 0.1}))
+        asked = ask(appliance, "/read", device.port, functionCode=3, address=5, timeout=60_000)
+    assert failure(asked) == (500, "timeout", "Connection timeout")
+
+
 def test_a_read_of_the_gateway_always_asks_the_device(run: Run) -> None:
     with Stream("tcp", in_turn=True) as device:
         appliance = run(with_gateway(device.url, link={"cache": 3600}))

@@ -194,6 +194,37 @@ def test_a_read_only_rule_passes_on_no_write(device: Stream, run: Run, connect: 
     assert [asked.pdu for asked in device.requests] == [READ]
 
 
+READ_AND_WRITE = READ + bytes.fromhex("0000 01 0600011234 0000")
+"""A read, and what a line could take for its checksum and a write after it."""
+
+
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
+def test_a_read_only_rule_passes_on_nothing_behind_a_read(
+    kind: str, run: Run, connect: Connect, tmp_path: Path
+) -> None:
+    with Stream(kind) as device:
+        rule = {"access": "read-only"}
+        text = configuration(device.url, rule=rule, audit={"file": "audit.log"})
+        front = connect(scada(run(text)))
+        for request in (READ_AND_WRITE, bytes.fromhex("08 0000 a537 0000 01 0600011234 0000")):
+            assert front.ask(request) == exception(request, 1)
+        assert front.ask(READ) == FIVE
+        assert [asked.pdu for asked in device.requests] == [READ]
+        [line, *_] = await_writes(tmp_path / "audit.log", 1)
+    assert (line["function"], line["outcome"]) == (3, "illegal_function")
+
+
+def test_what_a_line_would_take_for_several_requests_is_not_sent(
+    run: Run, connect: Connect
+) -> None:
+    with Stream("rtu+tcp") as device:
+        front = connect(scada(run(configuration(device.url))))
+        for request in (READ_AND_WRITE, WRITE[:-1], bytes.fromhex("100001000102")):
+            assert front.ask(request) == exception(request, 3)
+        assert front.ask(READ) == FIVE
+        assert [asked.pdu for asked in device.requests] == [READ]
+
+
 def test_a_route_to_a_device_sends_its_unit_id_and_a_link_keeps_that_of_the_request(
     device: Stream, run: Run, connect: Connect
 ) -> None:
@@ -588,6 +619,29 @@ def test_a_full_queue_is_exception_06(device: Stream, run: Run, connect: Connect
     assert first.receive().pdu == FIVE
     assert counters(appliance)["refused_full"] == 1
     assert [asked.pdu for asked in device.requests] == [READ]
+
+
+def test_a_client_that_connects_again_and_again_leaves_places_to_others(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, link={"queue": 4}))
+    first = connect(scada(appliance))
+    first.send(wire.frame(READ))
+    device.await_requests(1)
+    gone = connect(scada(appliance))
+    gone.send(wire.frame(WRITE))
+    await_count(appliance, "waiting", 2)
+    gone.reset()
+
+    again = connect(scada(appliance))
+    assert again.ask(WRITE) == exception(WRITE, 6)
+    other = connect(scada(appliance), source="127.0.0.2")
+    other.send(wire.frame(WRITE))
+    await_count(appliance, "waiting", 3)
+    held.release()
+    assert other.receive().pdu == WRITE
 
 
 def test_the_write_of_a_client_that_has_gone_is_not_sent(

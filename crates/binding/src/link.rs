@@ -74,12 +74,10 @@ pub struct Link {
 impl Link {
     #[pyo3(signature = (name, *, timeout, unit=None))]
     fn route(&self, name: &str, timeout: f64, unit: Option<i128>) -> PyResult<Route> {
-        let core = CoreRoute {
-            name: name.into(),
-            link: Arc::clone(&self.core),
-            unit_id: unit.map(|unit| byte("unit", unit)).transpose()?,
-            timeout: seconds("timeout", timeout)?,
-        };
+        let timeout = seconds("timeout", timeout)?;
+        let unit_id = unit.map(|unit| byte("unit", unit)).transpose()?;
+        self.core.note_route(timeout);
+        let core = CoreRoute { name: name.into(), link: Arc::clone(&self.core), unit_id, timeout };
         Ok(Route { core })
     }
 

@@ -61,6 +61,8 @@ pub(crate) struct Waiting {
     timeout: Duration,
     /// `None` for a timeout that never ends.
     until: Option<Instant>,
+    /// The longest wait for the reply, once it was sent.
+    longest_wait: Duration,
     is_broadcast: bool,
     has_ended: bool,
 }
@@ -89,7 +91,9 @@ impl Caller {
         state.pending.insert(ticket, Pending { request: request.clone(), is_sent: false });
         drop(state);
         let (caller, until) = (Arc::clone(self), Instant::now().checked_add(timeout));
-        (ticket, Waiting { caller, ticket, timeout, until, is_broadcast, has_ended: false })
+        let longest_wait = Duration::MAX;
+        let has_ended = false;
+        (ticket, Waiting { caller, ticket, timeout, until, longest_wait, is_broadcast, has_ended })
     }
 
     /// Gives a call up: it is not sent if its turn has not come. Returns whether its turn has come; such a
@@ -122,9 +126,15 @@ impl Caller {
 }
 
 impl Waiting {
+    pub(super) fn at_most(mut self, longest_wait: Duration) -> Waiting {
+        self.longest_wait = longest_wait;
+        self
+    }
+
     /// How long to wait for a reply to a request that is sent now.
     pub(super) fn reply_timeout(&self) -> Duration {
-        if self.is_broadcast { self.left().min(BROADCAST_TIMEOUT) } else { self.left() }
+        let longest = if self.is_broadcast { BROADCAST_TIMEOUT } else { self.longest_wait };
+        self.left().min(longest)
     }
 
     /// The time that is left.

@@ -1,10 +1,12 @@
 //! A link as listeners and event loops see it, from any thread.
 
 use std::net::IpAddr;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use holdfast_protocol::client::Tolerance;
+use holdfast_protocol::frame::rtu_stream::is_one_request;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
 use holdfast_runtime::Retry;
 use tokio::sync::mpsc;
@@ -12,7 +14,7 @@ use tokio::sync::mpsc;
 use super::caller::{Caller, Waiting};
 use crate::client::{ClientError, Endpoint, StrayCounters};
 use crate::counter::counters;
-use crate::link::limits::queue_share::{Place, QueueShare};
+use crate::link::limits::queue_share::{Place, QueueShare, Source};
 use crate::link::scheduling::in_flight::InFlight;
 use crate::link::scheduling::pending_reply::{PendingReply, ReplyTo, pending_reply};
 use crate::link::scheduling::queue::Priority;
@@ -78,6 +80,9 @@ pub struct SharedLink {
     strays: OnceLock<Arc<StrayCounters>>,
     preferred: Vec<IpAddr>,
     tolerance: Tolerance,
+    has_rtu_frames: bool,
+    /// The longest wait for a reply of its routes, in nanoseconds; 0 without routes.
+    longest_wait: AtomicU64,
 }
 
 /// A request of a listener or of an event loop.
@@ -111,8 +116,6 @@ pub(crate) struct Asker {
     pub(crate) source: u64,
     /// `None` on a serial line.
     pub(crate) peer: Option<IpAddr>,
-    /// Its requests that wait for replies.
-    pub(crate) waiting: usize,
 }
 
 /// Where the requests to a unit of a listener go.
@@ -136,6 +139,8 @@ impl SharedLink {
             strays: OnceLock::new(),
             preferred: settings.preferred.clone(),
             tolerance: settings.endpoint.tolerance,
+            has_rtu_frames: settings.endpoint.place.transport().has_rtu_frames(),
+            longest_wait: AtomicU64::new(0),
         }
     }
 
@@ -154,6 +159,21 @@ impl SharedLink {
         self.queue.waiting()
     }
 
+    /// The clients of a route wait so long for a reply.
+    pub fn note_route(&self, timeout: Duration) {
+        let nanos = u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX);
+        self.longest_wait.fetch_max(nanos, Ordering::Relaxed);
+    }
+
+    /// How long an event loop may keep the line waiting for one reply: no longer than clients of routes, who
+    /// wait for it meanwhile.
+    fn longest_wait(&self) -> Duration {
+        match self.longest_wait.load(Ordering::Relaxed) {
+            0 => Duration::MAX,
+            nanos => Duration::from_nanos(nanos),
+        }
+    }
+
     /// Sends a request of an event loop on its way. `timeout` includes the wait for the turn. A
     /// broadcast ends without a reply. Returns the ticket of the call; `None` when the queue is full.
     pub fn call(
@@ -165,12 +185,13 @@ impl SharedLink {
         is_broadcast: bool,
     ) -> Option<u64> {
         self.counters.requests.add();
-        let place = self.admitted(self.queue.place_of_event_loop())?;
+        let place = self.admitted(self.queue.place(Source::EventLoops))?;
         // Its reply is parsed as one to the request that is sent.
         let adapted = self.tolerance.adapted(request);
         let request = adapted.as_ref().unwrap_or(request);
         let priority = Priority::of(request, None, &self.preferred);
         let (ticket, waiting) = caller.begin(request, timeout, is_broadcast);
+        let waiting = waiting.at_most(self.longest_wait());
         let (request, source) = (request.clone(), caller.source);
         let reply = Reply { to: Receiver::EventLoop(waiting), in_order: None, _place: place };
         // If the link has ended, the call ends as lost.
@@ -191,7 +212,8 @@ impl Route {
     /// Sends a request on its way, unchanged.
     ///
     /// # Errors
-    /// The exception to refuse it with: the queue is full, or the link has ended.
+    /// The exception to refuse it with: the queue is full, the link has ended, or devices on its line
+    /// would take it for several requests, perhaps to other units.
     pub(crate) fn ask(
         &self,
         asker: &Asker,
@@ -201,7 +223,10 @@ impl Route {
         let link = &self.link;
         link.counters.requests.add();
         let request = EncodedRequest::opaque(pdu).ok_or(ExceptionCode::IllegalFunction)?;
-        let place = link.admitted(link.queue.place(asker.waiting));
+        if link.has_rtu_frames && !is_one_request(pdu) {
+            return Err(ExceptionCode::IllegalDataValue);
+        }
+        let place = link.admitted(link.queue.place(Source::client(asker.peer)));
         let place = place.ok_or(ExceptionCode::ServerDeviceBusy)?;
         let priority = Priority::of(&request, asker.peer, &link.preferred);
         let (to, pending) = pending_reply();

@@ -207,6 +207,27 @@ enum DataLen {
     Unknown,
 }
 
+/// Whether a server that takes requests from a line takes this PDU as one request. One of a function of the
+/// standard that is too long is a request and the beginning of another one for a server that knows their
+/// lengths, as most do; for functions that it does not know, a length can't be known.
+///
+/// ```
+/// use holdfast_protocol::frame::rtu_stream::is_one_request;
+///
+/// assert!(is_one_request(&[3, 0, 5, 0, 1]));
+/// assert!(!is_one_request(&[3, 0, 5, 0, 1, 0x94, 0x0B, 1, 6, 0, 5, 0xBE, 0xEF]));
+/// assert!(!is_one_request(&[16, 0, 5, 0, 1, 2, 0xBE]));
+/// assert!(is_one_request(&[66, 1, 2, 3]));
+/// ```
+pub fn is_one_request(pdu: &[u8]) -> bool {
+    let Some((function_code, data)) = pdu.split_first() else { return false };
+    match request_data_len(*function_code, data) {
+        DataLen::Known(len) => data.len() == len,
+        DataLen::Incomplete => false,
+        DataLen::Unknown => true,
+    }
+}
+
 /// Returns the length of the data between function code and CRC (V1.1b3, 6).
 fn request_data_len(function_code: u8, data: &[u8]) -> DataLen {
     let counted = |at: usize| {

@@ -1,55 +1,90 @@
 //! How much of the queue of a link one source may fill: no more than it leaves to others. All event loops
-//! together are one source.
+//! together are one source, and so are all connections from one address: a client can't get another share
+//! by connecting again.
 
-use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::collections::HashMap;
+use std::net::IpAddr;
+use std::sync::{Arc, Mutex};
+
+use holdfast_runtime::lock;
+
+/// Who asks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(in crate::link) enum Source {
+    EventLoops,
+    SerialLines,
+    Address(IpAddr),
+}
 
 /// The requests that wait or are in flight, without those of the poller.
 #[derive(Debug)]
 pub(in crate::link) struct QueueShare {
     most: usize,
-    waiting: AtomicUsize,
-    /// Requests of event loops among those.
-    of_event_loops: AtomicUsize,
+    /// Those of each source that has any.
+    waiting: Mutex<HashMap<Source, usize>>,
 }
 
 /// A place in the queue, until it is dropped.
 pub(in crate::link) struct Place {
     queue: Arc<QueueShare>,
-    is_of_event_loop: bool,
+    source: Source,
+}
+
+impl Source {
+    /// A client of a listener; `None` on a serial line.
+    pub(in crate::link) fn client(peer: Option<IpAddr>) -> Source {
+        peer.map_or(Source::SerialLines, |peer| Source::Address(peer.to_canonical()))
+    }
 }
 
 impl QueueShare {
     pub(in crate::link) fn new(most: usize) -> Arc<QueueShare> {
-        let (waiting, of_event_loops) = (AtomicUsize::new(0), AtomicUsize::new(0));
-        Arc::new(QueueShare { most, waiting, of_event_loops })
+        Arc::new(QueueShare { most, waiting: Mutex::default() })
     }
 
     pub(in crate::link) fn waiting(&self) -> usize {
-        self.waiting.load(Ordering::Relaxed)
+        lock(&self.waiting).values().sum()
     }
 
-    /// A place for a request of an event loop, unless the queue is full for them.
-    pub(in crate::link) fn place_of_event_loop(self: &Arc<QueueShare>) -> Option<Place> {
-        let own = self.of_event_loops.fetch_add(1, Ordering::Relaxed);
-        self.place_beside(own, true)
-    }
-
-    /// A place for a request of a source that has so many others here, unless the queue is full for it.
-    pub(in crate::link) fn place(self: &Arc<QueueShare>, own: usize) -> Option<Place> {
-        self.place_beside(own, false)
-    }
-
-    fn place_beside(self: &Arc<QueueShare>, own: usize, is_of_event_loop: bool) -> Option<Place> {
-        let before = self.waiting.fetch_add(1, Ordering::Relaxed);
-        let place = Place { queue: Arc::clone(self), is_of_event_loop };
-        (self.most.saturating_sub(before) > own).then_some(place)
+    /// A place for a request, unless the queue is full for its source.
+    pub(in crate::link) fn place(self: &Arc<QueueShare>, source: Source) -> Option<Place> {
+        let mut waiting = lock(&self.waiting);
+        let all: usize = waiting.values().sum();
+        let own = waiting.get(&source).copied().unwrap_or_default();
+        if self.most.saturating_sub(all) <= own {
+            return None;
+        }
+        *waiting.entry(source).or_default() += 1;
+        Some(Place { queue: Arc::clone(self), source })
     }
 }
 
 impl Drop for Place {
     fn drop(&mut self) {
-        self.queue.waiting.fetch_sub(1, Ordering::Relaxed);
-        self.queue.of_event_loops.fetch_sub(usize::from(self.is_of_event_loop), Ordering::Relaxed);
+        let mut waiting = lock(&self.queue.waiting);
+        let own = waiting.get_mut(&self.source).expect("a source with a place is counted");
+        *own -= 1;
+        if *own == 0 {
+            waiting.remove(&self.source);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_client_leaves_places_to_others_however_often_it_connects() {
+        let queue = QueueShare::new(8);
+        let [one, other] = [1, 2].map(|last| Source::client(Some(IpAddr::from([127, 0, 0, last]))));
+        let mut places: Vec<_> = (0..9).map_while(|_| queue.place(one)).collect();
+        assert_eq!(places.len(), 4);
+        places.extend(queue.place(other));
+        places.extend(queue.place(Source::EventLoops));
+        assert_eq!(queue.waiting(), 6);
+        assert!(queue.place(one).is_none());
+        places.clear();
+        assert!(lock(&queue.waiting).is_empty());
     }
 }

@@ -104,7 +104,7 @@ impl Deferred {
             }
             _ => return Deferral::Wait,
         };
-        let asker = Asker { source: self.source, peer: Some(peer), waiting: self.waiting.len() };
+        let asker = Asker { source: self.source, peer: Some(peer) };
         let (asked, reply, refused) =
             Asked::send(context, place, (tag, unit_id, request), |permitted| {
                 unit_server.forward(rights, place, &asker, unit_id, request, permitted)

@@ -1,5 +1,6 @@
 //! Which functions a rule allows, and which requests are known to only read.
 
+use holdfast_protocol::frame::rtu_stream::is_one_request;
 use holdfast_protocol::pdu::{Function, Request};
 
 /// What answers the requests to a unit.
@@ -96,8 +97,12 @@ pub(in crate::server) fn is_write(request: &[u8]) -> bool {
     Function::from_code(code).is_some_and(Function::is_write)
 }
 
-/// Whether a request is known to change nothing in a device.
+/// Whether a request is known to change nothing in a device. Behind a line, or behind a gateway to one,
+/// one that is too long is a read and whatever follows it.
 pub(in crate::server) fn only_reads(request: &[u8]) -> bool {
+    if !is_one_request(request) {
+        return false;
+    }
     let code = request.first().copied().unwrap_or_default();
     match Function::from_code(code) {
         Some(Function::Diagnostics | Function::EncapsulatedInterface) => {

@@ -306,7 +306,7 @@ impl ModbusSerial {
         }
         let rights = self.rights.get();
         if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
-            let asker = Asker { source: self.source, peer: None, waiting: 0 };
+            let asker = Asker { source: self.source, peer: None };
             let asked = Asked::send(context, place, (0, unit_id, request), |permitted| {
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
             });

@@ -195,7 +195,7 @@ impl ModbusUdp {
         if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
             let asker = later.asker(peer.ip());
             let asked = Asked::send(context, place, (tag, unit_id, request), |permitted| {
-                if later.is_full(asker.waiting) {
+                if later.is_full(peer.ip()) {
                     return Err(ExceptionCode::ServerDeviceBusy);
                 }
                 self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
@@ -248,16 +248,18 @@ impl Later {
     }
 
     fn asker(&self, address: IpAddr) -> Asker {
-        let (source, waiting) = match self.clients.get(&address) {
-            Some(client) => (client.source, client.waiting),
-            None => (source(), 0),
-        };
-        Asker { source, peer: Some(address), waiting }
+        let source = self.clients.get(&address).map_or_else(source, |client| client.source);
+        Asker { source, peer: Some(address) }
     }
 
-    /// Whether a client with so many requests must wait: it may have no more than it leaves to others.
-    fn is_full(&self, own: usize) -> bool {
-        MAX_PENDING_REPLIES.saturating_sub(self.replies.len()) <= own
+    /// The requests of a client that wait for replies.
+    fn waiting(&self, address: IpAddr) -> usize {
+        self.clients.get(&address).map_or(0, |client| client.waiting)
+    }
+
+    /// Whether a client must wait: it may have no more requests than it leaves to others.
+    fn is_full(&self, address: IpAddr) -> bool {
+        MAX_PENDING_REPLIES.saturating_sub(self.replies.len()) <= self.waiting(address)
     }
 
     fn begin(
@@ -355,16 +357,16 @@ mod tests {
         let mut later = Later::new(watch::channel(false).1);
         let first = later.asker(one);
         later.begin(&first, one, std::future::pending());
-        while !later.is_full(later.asker(one).waiting) {
+        while !later.is_full(one) {
             let asker = later.asker(one);
             assert_eq!(asker.source, first.source);
             later.begin(&asker, one, std::future::pending());
         }
         assert_eq!(later.replies.len(), MAX_PENDING_REPLIES / 2);
         let asker = later.asker(other);
-        assert_eq!((asker.waiting, later.is_full(asker.waiting)), (0, false));
+        assert_eq!((later.waiting(other), later.is_full(other)), (0, false));
         assert_ne!(asker.source, first.source);
-        (0..later.asker(one).waiting).for_each(|_| later.end(one));
+        (0..later.waiting(one)).for_each(|_| later.end(one));
         assert!(later.clients.is_empty());
     }
 
