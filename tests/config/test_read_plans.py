@@ -14,10 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast._core import plan_blocks
-from holdfast.config import read_plans
+from holdfast.appliance import Appliance
+from holdfast.config import load, read_plans
 from holdfast.types import AREAS, BIT_AREAS
+from support import wire
 from support.cases import examples
 from support.cli import answer, done, usage_error
+from support.polled import Fake, asked, data
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -507,3 +510,81 @@ def test_wrong_usage_of_plan_with_a_file_is_told(file: str, tmp_path: Path) -> N
     rest = {"bind": "127.0.0.1:1", "sources": ["127.0.0.1"], "tokens": "none"}
     empty.write_text(json.dumps({"memories": {"a": {"coils": 1}}, "rest": rest}))
     assert "has no devices." in usage_error("check", "plan", str(empty))
+
+
+TAGGED = """\
+profiles:
+  meter:
+    tags:
+      power: {{area: input_registers, address: 0, type: float32}}
+      energy:
+        area: input_registers
+        address: 20
+        scale: {{from: {{area: input_registers, address: 22, type: int16}}, as: exponent}}
+devices:
+  meter:
+    url: {url}
+    interval: 0.02
+    profile: meter
+    max_gap: 2
+    reads: [{{area: input_registers, address: 4, count: 3}}]
+    forward: [{{url: "raw://127.0.0.1:9", unit: 1}}]
+    tags:
+      alarm: {{area: input_registers, address: 4, type: "bit:0"}}
+      fault: {{area: input_registers, address: 4, type: "bit:1"}}
+  doors:
+    url: tcp://10.0.0.9
+    interval: 60
+    tags: {{{doors}}}
+"""
+
+
+@pytest.fixture
+def tagged(tmp_path: Path) -> Path:
+    path = tmp_path / "tagged.yaml"
+    doors = ", ".join(f"d{at}: {{area: coils, address: {at}}}" for at in range(9))
+    path.write_text(TAGGED.format(url="tcp://10.0.0.8", doors=doors))
+    return path
+
+
+def test_a_plan_names_reads_and_tags(tagged: Path) -> None:
+    assert done("check", "plan", str(tagged)) == [
+        "meter: tcp://10.0.0.8 unit 1, every 0.02 s",
+        "",
+        "area             address  count  reads                   gaps  why it ends",
+        "input_registers        0      7  power, alarm, fault, 0  2-3   gap: 13, max_gap is 2",
+        "input_registers       20      3  energy                        nothing more to read",
+        "",
+        "2 requests, 2 extra addresses read",
+        "",
+        "doors: tcp://10.0.0.9 unit 1, every 60 s",
+        "",
+        "area   address  count  reads                           gaps  why it ends",
+        "coils        0      9  d0, d1, d2, d3, d4, d5, 3 more        nothing more to read",
+        "",
+        "1 request",
+    ]
+    [plan] = answer("check", "plan", str(tagged), "--device", "meter")["plans"]
+    assert [read.get("tags") for read in plan["reads"]] == [
+        None,
+        ["power"],
+        ["energy"],
+        ["alarm", "fault"],
+    ]
+    assert [block["reads"] for block in plan["blocks"]] == [[1, 3, 0], [2]]
+
+
+def test_the_plan_is_what_a_device_is_asked(tagged: Path) -> None:
+    requests: list[tuple[int, int]] = []
+
+    def answered(request: wire.Frame) -> bytes:
+        requests.append(asked(request))
+        return data(request)
+
+    with Fake(answered) as fake:
+        tagged.write_text(tagged.read_text().replace("tcp://10.0.0.8", fake.url))
+        [plan] = answer("check", "plan", str(tagged), "--device", "meter")["plans"]
+        with Appliance(load(tagged)):
+            wire.until(lambda: len(requests) >= 4, "it was polled twice")
+    places = [(block["address"], block["count"]) for block in plan["blocks"]]
+    assert requests[:4] == places * 2

@@ -31,7 +31,7 @@ def read(*blocks: PolledBlock) -> dict[str, tuple[Any, int, str | None]]:
 
 
 def test_one_field_has_a_value_and_its_scale() -> None:
-    assert Reader("meter", TAGS).fields == [(HR, 0, 4), (HR, 3, 1)]
+    assert list(Reader("meter", TAGS).fields) == [(HR, 0, 4), (HR, 3, 1)]
     assert read(block(0, 432, 0, 0, 1)) == {"power": (4320, 0, None), "sf": (1, 0, None)}
 
 

@@ -120,7 +120,7 @@ class Poller:
                 interval=interval,
                 timeout=timeout,
                 reads=[],
-                fields=reader.fields,
+                fields=list(reader.fields),
                 report=self._results,
                 max_gap=max_gap,
                 max_registers=max_registers,

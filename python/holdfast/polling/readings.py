@@ -96,10 +96,12 @@ class Reader:
         self._blocks: dict[tuple[Area, int, int], tuple[Sequence[Tag], Decoder | None]] = {}
 
     @property
-    def fields(self) -> list[tuple[Area, int, int]]:
-        """What has to be read: areas, addresses and counts, each once."""
-        places = ((tag.area, tag.span.start, len(tag.span)) for tag in self.tags)
-        return list(dict.fromkeys(places))
+    def fields(self) -> dict[tuple[Area, int, int], list[str]]:
+        """What has to be read: areas, addresses and counts, each with the names of its tags."""
+        found: dict[tuple[Area, int, int], list[str]] = {}
+        for tag in self.tags:
+            found.setdefault((tag.area, tag.span.start, len(tag.span)), []).append(tag.name)
+        return found
 
     def poll(self, blocks: Sequence[PolledBlock]) -> DevicePoll:
         """The readings of one poll, one for each tag, in the order of the tags.

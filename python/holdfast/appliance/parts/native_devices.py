@@ -42,7 +42,7 @@ def device(
     `report` takes the polls of devices with tags. A `fence` stops polls while it is closed.
     """
     settings = config.devices[name]
-    fields = Reader(name, config.tags(name)).fields
+    fields = list(Reader(name, config.tags(name)).fields)
     status = settings.status
     assert settings.interval is not None, "a device that is polled has an interval"
     return _core.PolledDevice(

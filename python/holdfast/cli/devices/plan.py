@@ -28,6 +28,7 @@ from holdfast.cli.options.value_type import typed
 from holdfast.cli.terminal_text import print_json
 from holdfast.config import read_plans
 from holdfast.config.read_plans import Preset
+from holdfast.polling.readings import Reader
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS, READ_REGISTERS
 
 if TYPE_CHECKING:
@@ -39,6 +40,9 @@ if TYPE_CHECKING:
 
 FILL = 50
 """The default of `--fill`."""
+
+MAX_NAMED = 6
+"""The most reads and tags that the text names for one request. JSON names all."""
 
 
 def _cost(text: str) -> tuple[float, float]:
@@ -140,13 +144,21 @@ class _Shown:
     """A plan and its device."""
 
     def __init__(
-        self, plan: Plan, rules: Rules, url: str, name: str | None, of: DeviceConfig | None
+        self,
+        plan: Plan,
+        rules: Rules,
+        url: str,
+        name: str | None = None,
+        of: DeviceConfig | None = None,
+        tags: Sequence[Sequence[str]] = (),
     ) -> None:
         self.plan = plan
         self.rules = rules
         self.url = url
         self.name = name
         self.of = of
+        self.tags = [*[()] * (len(plan.reads) - len(tags)), *tags]
+        """For each read the names of its tags, none for those in `reads`, which are first."""
 
     @property
     def title(self) -> str:
@@ -166,7 +178,7 @@ def _of_url(
     if not reads:
         raise click.UsageError("URL requires at least one ITEM, as in hr:100 20.")
     rules: Rules = {**given}  # type: ignore[typeddict-item]
-    return _Shown(read_plans.plan(reads, rules), rules, url, None, None)
+    return _Shown(read_plans.plan(reads, rules), rules, url)
 
 
 def _of_file(
@@ -174,10 +186,10 @@ def _of_file(
 ) -> Iterator[_Shown]:
     if reads:
         raise click.UsageError("ITEM requires URL: FILE has its own reads.")
-    configured = load_or_exit(file).devices
-    devices = {name: device for name, device in configured.items() if device.reads}
+    config = load_or_exit(file)
+    devices = {name: device for name, device in config.devices.items() if device.has_readings}
     if not devices:
-        what = "no devices with reads" if configured else "no devices"
+        what = "no devices with reads or tags" if config.devices else "no devices"
         raise click.UsageError(f"{file} has {what}.")
     for name in names or devices:
         require_known(name, devices, f"{file} has no device", "devices")
@@ -187,7 +199,9 @@ def _of_file(
             rules["max_gap"] = rules["cost"] = None
         rules |= given  # type: ignore[typeddict-item]
         asked = [(read.area, read.address, read.count) for read in settings.reads]
-        yield _Shown(read_plans.plan(asked, rules), rules, settings.url, name, settings)
+        fields = Reader(name, config.tags(name)).fields
+        planned = read_plans.plan([*asked, *fields], rules)
+        yield _Shown(planned, rules, settings.url, name, settings, list(fields.values()))
 
 
 def _compared(preset: Preset | None, fill: int | None, shown: _Shown) -> dict[str, Any] | None:
@@ -212,7 +226,10 @@ def _to_json(shown: _Shown, compared: dict[str, Any] | None) -> dict[str, Any]:
         "requests": len(plan.blocks),
         "unwanted": plan.unwanted,
         "cost_ms": plan.cost,
-        "reads": [_place(*read) for read in plan.reads],
+        "reads": [
+            {**_place(*field), **({"tags": list(tags)} if tags else {})}
+            for field, tags in zip(plan.reads, shown.tags, strict=True)
+        ],
         "blocks": [
             {
                 **_place(block.area, block.address, block.count),
@@ -237,7 +254,7 @@ def _lines(shown: _Shown, compared: dict[str, Any] | None) -> list[str]:
     head = ["area", "address", "count", "reads", "gaps"]
     has_cost = plan.cost is not None
     rows = [
-        [*_cells(block), *([f"{block.cost:g}"] if has_cost else []), block.ends]
+        [*_cells(block, shown), *([f"{block.cost:g}"] if has_cost else []), block.ends]
         for block in plan.blocks
     ]
     lines = [
@@ -259,13 +276,15 @@ def _lines(shown: _Shown, compared: dict[str, Any] | None) -> list[str]:
     return lines
 
 
-def _cells(block: Block) -> list[str]:
+def _cells(block: Block, shown: _Shown) -> list[str]:
+    named = [name for number in block.reads for name in shown.tags[number] or (str(number),)]
+    more = len(named) - MAX_NAMED
     holes = [_span(at, count) for at, count in block.holes]
     return [
         block.area,
         str(block.address),
         str(block.count),
-        ", ".join(map(str, block.reads)),
+        ", ".join(named[:MAX_NAMED]) + (f", {more} more" if more > 0 else ""),
         ", ".join(holes),
     ]
 
