@@ -126,12 +126,6 @@ def sql(block: Block, stage: Stage) -> None:
         database.close()
 
 
-def unit_file(block: Block, _: Stage) -> None:
-    """The command of a unit file of systemd can be parsed."""
-    [command] = re.findall(r"^ExecStart=\S+/holdfast (.*)$", block.text, re.MULTILINE)
-    commands.parse(command.split())
-
-
 def drop_in(block: Block, _: Stage) -> None:
     """The settings are of kinds that the unit of the package has."""
     unit = (ROOT / "packaging/deb/debian/holdfast-modbus.holdfast.service").read_text()

@@ -103,7 +103,6 @@ DECISIONS: dict[tuple[str, str], Decision] = {
     ("docs/moving-from-mma.md", "# Made by"): MMA,
     ("docs/mqtt.md", "2026-11-21T"): checks.log_lines,
     ("docs/mqtt.md", '{"connected": true'): diagnostics,
-    ("docs/operations.md", "[Service]"): checks.unit_file,
     ("docs/operations.md", '{"ok": false, "checks"'): checks.readiness,
     ("docs/operations.md", "startupProbe:"): checks.kubernetes_probes,
     ("docs/operations.md", "2026-11-21T"): checks.log_lines,
