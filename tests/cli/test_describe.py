@@ -308,3 +308,17 @@ def test_a_file_that_can_not_be_replaced_stays_as_it_is(
     assert re.search(r"^holding_registers +0 +8 +9$", result.stdout, re.M)
     assert file.read_text() == "mine"
     assert list(tmp_path.iterdir()) == [file]
+    monkeypatch.undo()
+    file.write_text("order: " + result.stdout.partition("\n\norder: ")[2])
+    assert len(load_tags(file)) == 9
+
+
+@pytest.mark.parametrize("name", ["folder.yaml", f"{'a' * 250}.yaml", f"{'a' * 300}.yaml"], ids=len)
+def test_a_file_that_can_not_be_written_is_told_before_the_first_request(
+    name: str, tmp_path: Path
+) -> None:
+    (tmp_path / "folder.yaml").mkdir()
+    with FakeDevice(small) as device:
+        error = usage_error("describe", device.url, "--output", str(tmp_path / name), "--force")
+        assert not device.asked
+    assert f"{name} is a folder." in error or f"{name} can't be written: " in error

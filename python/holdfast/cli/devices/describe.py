@@ -72,6 +72,18 @@ def _file(text: str) -> Path:
     return path
 
 
+def _require_writable(file: Path, *, force: bool) -> None:
+    """Raises `click.UsageError` for a file that can't be written, before a search of minutes."""
+    try:
+        if file.exists() and not force:
+            raise click.UsageError(f"{file} exists; --force replaces it.")
+        if file.is_dir():
+            raise click.UsageError(f"{file} is a folder.")
+        files.try_replace(file)
+    except OSError as error:
+        raise click.UsageError(f"{file} can't be written: {error.strerror}.") from error
+
+
 SUBCOMMANDS = {
     "map": ("devices.map_command:map_", "Find the addresses of a device."),
     "guess": ("devices.guess:guess", "Guess the type and byte order of a value."),
@@ -124,7 +136,7 @@ def describe(
 
     Ctrl-C, or SIGTERM, prints and writes the results so far, where the search did not look, and
     what has no tags yet. A second one ends the command at once. FILE is replaced as a whole, or
-    not at all.
+    not at all. If it can't be written at the end, the tag list is printed.
 
     Exit codes: 0 done; 1 no unit id answered, or the search ended early; 2 wrong usage.
     """
@@ -132,8 +144,8 @@ def describe(
     asked = units or (LINE_UNITS if is_line else UNITS)
     if is_line:
         refuse_broadcast(asked)
-    if output is not None and output.exists() and not force:
-        raise click.UsageError(f"{output} exists; --force replaces it.")
+    if output is not None:
+        _require_writable(output, force=force)
     with interruptions() as signals:
         report = Report({"target": url} if as_json else None, signals)
         most = None if everything else MAX_LINES
@@ -263,25 +275,26 @@ class _Run:
             infer(seconds=INFERENCE_S)
         else:
             why = self._attempt(infer) or why
-        file = self._written(unit.found)
+        written = self._write(unit.found)
         self._report.text(*described_lines(unit.found, self._plan.most))
-        if file is not None:
-            self._files.append(str(file))
-            self._report.text(f"Written: {file}")
+        self._report.text(*written)
         return why
 
-    def _written(self, found: Description) -> Path | None:
-        """Writes the tag list of a unit id: to a file of its own if several answer."""
+    def _write(self, found: Description) -> list[str]:
+        """Writes the tag list of a unit id: to a file of its own if several answer.
+
+        Returns what to print of it: the file, or the tag list if it can't be written.
+        """
         path = self._plan.output
         if path is None or not found.tags:
-            return None
+            return []
+        tags = [each.tag for each in found.tags]
+        text = tags_as_csv(tags) if path.suffix.lower() == ".csv" else tags_as_yaml(tags)
         if len(self._to_describe) > 1:
             path = path.with_stem(f"{path.stem}-unit{found.unit}")
             if path.exists() and not self._plan.replaces:
                 self._fail_to_write(f"{path} exists; --force replaces it")
-                return None
-        tags = [each.tag for each in found.tags]
-        text = tags_as_csv(tags) if path.suffix.lower() == ".csv" else tags_as_yaml(tags)
+                return ["", text]
         data = text.encode()
         if len(data) > MAX_BYTES:
             self._fail_to_write(
@@ -292,8 +305,9 @@ class _Run:
             files.replace(path, data)
         except OSError as error:
             self._fail_to_write(f"{path} can't be written: {error.strerror}")
-            return None
-        return path
+            return ["", text]
+        self._files.append(str(path))
+        return [f"Written: {path}"]
 
     def _fail_to_write(self, why: str) -> None:
         self._unwritten = self._unwritten or Ended("file", why)

@@ -43,12 +43,22 @@ def write_new(contents: Mapping[Path, tuple[bytes, int]]) -> None:
 
 def replace(file: Path, content: bytes, mode: int = PUBLIC) -> None:
     """Writes a file that programs may read at the same time. Raises `OSError`."""
-    new = file.with_name(f".{file.name}.{os.getpid()}")
-    # One that a power cut has left: in a container, the next process has the same number.
-    new.unlink(missing_ok=True)
-    write_new({new: (content, mode)})
+    new = _written_beside(file, content, mode)
     try:
         new.replace(file)
     except BaseException:
         new.unlink(missing_ok=True)
         raise
+
+
+def try_replace(file: Path) -> None:
+    """Raises `OSError` if the folder of a file does not allow `replace`. Changes nothing."""
+    _written_beside(file, b"", PUBLIC).unlink()
+
+
+def _written_beside(file: Path, content: bytes, mode: int) -> Path:
+    new = file.with_name(f".{file.name}.{os.getpid()}")
+    # One that a power cut has left: in a container, the next process has the same number.
+    new.unlink(missing_ok=True)
+    write_new({new: (content, mode)})
+    return new
