@@ -701,6 +701,9 @@ def test_the_number_in_flight_has_its_limits(number: Any) -> None:
         ("ascii:///dev/ttyS0", SerialTarget("ascii", "/dev/ttyS0", 19200, "even", 1, 7)),
         ("ascii:///dev/ttyS0?data_bits=8", SerialTarget("ascii", "/dev/ttyS0", data_bits=8)),
         ("rtu:///COM3", SerialTarget("rtu", "COM3")),
+        ("rtu://COM3", SerialTarget("rtu", "COM3")),
+        ("rtu://com3", SerialTarget("rtu", "com3")),
+        ("rtu://%5C%5C.%5CCOM10", SerialTarget("rtu", r"\\.\COM10")),
     ],
 )
 def test_a_url_names_a_device(url: str, target: NetworkTarget | SerialTarget) -> None:
@@ -761,6 +764,10 @@ def test_a_target_is_shown_as_a_url() -> None:
         ("tcp://plc#1", "has a user or a fragment"),
         ("rtu://", "has no device"),
         ("rtu:///", "has no device"),
+        ("rtu://10.0.0.5:502", r"RTU frames over TCP are rtu\+tcp://host:502"),
+        ("ascii://10.1.1.1", r"ASCII frames over TCP are ascii\+tcp://host:502"),
+        ("rtu://dev/ttyUSB0", "three slashes, as in rtu:///dev/ttyUSB0"),
+        ("rtu:ttyUSB0", "is not a serial line"),
         ("rtu:///dev/x?baud=10", "baud is '10', allowed: 50 to 4000000"),
         ("rtu:///dev/x?baud=fast", "baud is 'fast'"),
         ("rtu:///dev/x?parity=mark", "parity is 'mark', allowed: none, even, odd"),

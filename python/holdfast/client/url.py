@@ -333,10 +333,15 @@ def options_of(url: str, scheme: str, query: str) -> dict[str, Any]:
 
 def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
     device = unquote(path)
-    if re.fullmatch(r"/(COM[0-9]+|\\\\\.\\.+)", device):
-        device = device[1:]  # Ports of Windows have no leading slash.
+    if port := re.fullmatch(r"/?((?i:COM)[0-9]+|\\\\\.\\.+)", device):
+        device = port[1]  # Ports of Windows have no leading slash.
     if device in ("", "/"):
         raise ValueError(f"{url!r} has no device, allowed: {FORMS}")
+    if not port and not device.startswith("/"):
+        raise ValueError(
+            f"{url!r} is not a serial line, allowed: three slashes, as in {mode}:///dev/ttyUSB0, "
+            f"or {mode}://COM3; {mode.upper()} frames over TCP are {mode}+tcp://host:502"
+        )
     options = options_of(url, mode, query)
     if mode == "rtu" and options.get("data_bits", 8) != 8:
         raise ValueError(f"{url!r}: data_bits is 7, allowed with rtu: 8")
