@@ -217,6 +217,7 @@ def test_unit_ids_stay_known_if_the_device_goes_away() -> None:
         (("10.0.0.1", "--rate", "0"), "found 0, allowed: 0.1 to 1000"),
         (("/dev/ttyX", "--baud", "fast"), "'fast' is not a list of bauds, as in 9600,19200."),
         (("/dev/ttyX", "--parity", "mark"), "'mark' is not a list of none, even, odd."),
+        (("/run/lines/a", "--units", "0-3"), "Unit id 0 is the broadcast on a serial line"),
         (("/dev/ttyX", "--units", "0-3"), "Unit id 0 is the broadcast on a serial line"),
     ],
 )

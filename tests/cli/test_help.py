@@ -49,6 +49,8 @@ def test_the_help_imports_no_command() -> None:
         (("read", "plc", "hr", "0"), "for a host of that name, type tcp://plc."),
         (("read", "/dev/ttyUSB0", "hr", "0"), "type rtu:///dev/ttyUSB0?baud=19200&parity=even"),
         (("read", "COM3", "hr", "0"), "'holdfast find COM3' finds them."),
+        (("read", "/tmp/line", "hr", "0"), "'holdfast find /tmp/line' finds them."),
+        (("read", "/etc/plant.yaml", "hr", "0"), "'/etc/plant.yaml' is not the URL of a device"),
         (("read", "plant.yaml", "hr", "0"), "'plant.yaml' is not the URL of a device"),
     ],
 )

@@ -10,7 +10,7 @@ import click
 from holdfast.client.url import FORMS, parse
 from holdfast.net.addresses import address_in, bracketed
 
-SERIAL_DEVICE = re.compile(r"(/dev/.+|COM[0-9]+|\\\\\.\\.+)")
+SERIAL_DEVICE = re.compile(r"(/.+|COM[0-9]+|\\\\\.\\.+)")
 HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?(:[0-9]{1,5})?")
 ADDRESS_6 = re.compile(r"[0-9a-fA-F:.]*:[0-9a-fA-F.]*:[0-9a-fA-F:.]*")
 FILES = (".yaml", ".yml", ".json", ".csv")
@@ -37,13 +37,14 @@ def checked_url(text: str) -> str:
 
 def _url_of(text: str) -> str:
     """The URL of a host without a scheme. Raises `click.BadParameter` for other text."""
-    if SERIAL_DEVICE.fullmatch(text):
+    is_file = text.lower().endswith(FILES)
+    if SERIAL_DEVICE.fullmatch(text) and not is_file:
         raise click.BadParameter(
             f"{text!r} is a serial line: type rtu://{text}?baud=19200&parity=even, with its "
             f"settings. 'holdfast find {text}' finds them."
         )
     name, _, port = text.partition(":")
-    is_host = HOST.fullmatch(text) is not None and not text.lower().endswith(FILES)
+    is_host = HOST.fullmatch(text) is not None and not is_file
     if _is_address(text) or (is_host and ("." in name or port or name == "localhost")):
         return f"tcp://{bracketed(text) if ADDRESS_6.fullmatch(text) else text}"
     hint = f"; for a host of that name, type tcp://{text}" if is_host else ""
