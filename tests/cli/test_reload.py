@@ -100,6 +100,18 @@ def test_a_wrong_configuration_changes_nothing_and_every_problem_is_printed(
     assert log.count("error reload_refused problem=") == 3
 
 
+def test_warnings_of_a_reload_are_those_of_check(running: Running) -> None:
+    running.file.write_text(
+        running.file.read_text()
+        + "      - {sources: [127.0.0.1], units: {1: plant}, access: read-only}\n"
+    )
+    checked = invoke("check", str(running.file))
+    assert "warning: " in checked.stderr
+    result = invoke("reload", str(running.file))
+    assert (result.exit_code, result.stderr) == (0, checked.stderr)
+    assert "warning config_warning warning=" in running.end()
+
+
 def test_initial_values_are_said_to_wait_for_the_next_start(running: Running) -> None:
     text = running.file.read_text()
     (running.file.parent / "values.csv").write_text("holding_registers,1,5\n")

@@ -18,7 +18,8 @@ def reload(file: Path) -> None:
     """Have the appliance that runs FILE on this machine reread it.
 
     The whole configuration and all files that it names are checked first. If anything is wrong, the
-    appliance goes on as before, and every problem is printed. Exit codes: 0 reloaded, 1 no
+    appliance goes on as before, and every problem is printed. Warnings are those of `holdfast
+    check`. Exit codes: 0 reloaded, 1 no
     appliance of this user runs FILE, or it does not answer, 2 refused, 3 an internal error: restart
     the appliance.
     """
@@ -36,5 +37,8 @@ def reload(file: Path) -> None:
             click.echo(problem, err=True)
         click.echo("Nothing has changed.", err=True)
         sys.exit(ExitCode.WRONG)
+    # An appliance of an earlier version only logs its warnings.
+    for warning in answer.get("warnings", ()):
+        click.echo(f"warning: {warning}", err=True)
     changed = answer["changed"]
     click.echo(f"Reloaded: {', '.join(changed)}" if changed else "Reloaded: nothing has changed")

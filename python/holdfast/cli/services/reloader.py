@@ -226,15 +226,20 @@ class Reloader:
             log_lines.write(logging.ERROR, "reload_refused", problem=problem)
         if problems:
             return {"problems": problems}
-        for warning in config.warnings:
-            log_lines.write(logging.WARNING, "config_warning", warning=str(warning))
+        warnings = [str(warning) for warning in config.warnings]
+        for warning in warnings:
+            log_lines.write(logging.WARNING, "config_warning", warning=warning)
         log_lines.write(
             logging.INFO,
             "reloaded",
             changed=" ".join(changed) or "nothing",
             sha256=config.sha256 or "-",
         )
-        return {"changed": described(changed, before, config), "sha256": config.sha256}
+        return {
+            "changed": described(changed, before, config),
+            "sha256": config.sha256,
+            "warnings": warnings,
+        }
 
     def _placed(self, problem: str) -> str:
         return problem if self._file is None else f"{self._file}: {problem}"
