@@ -147,3 +147,27 @@ def test_a_reader_that_is_gone_is_an_invalid_argument_on_windows(
     assert standard_output.reason(gone) == "Broken pipe"
     assert not standard_output.is_unwritable(refused)
     assert not standard_output.is_unwritable(OSError(errno.EINVAL, "Invalid argument", "a.yaml"))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a shell of Unix closes the streams")
+@pytest.mark.parametrize(
+    ("closed", "words", "code"),
+    [
+        (">&-", "describe map {url} --areas hr --range 0-9", 0),
+        ("2>&-", "find {url} --units 1", 0),
+        ("2>&-", "read {url} hr:0", 0),
+        ("<&-", "token --stdin", 2),
+        ("<&- >&- 2>&-", "describe {url} --units 1 --range 0-9", 0),
+    ],
+)
+def test_a_closed_stream_is_no_crash(closed: str, words: str, code: int) -> None:
+    memory = holdfast.Memory(holding_registers=3)
+    with holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-only") as server:
+        command = [*HOLDFAST, *words.format(url=cli.url(server)).split()]
+        ended = subprocess.run(
+            ["sh", "-c", f'exec "$@" {closed}', "sh", *command],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert (ended.returncode, "Traceback" in ended.stderr) == (code, False), ended.stderr

@@ -1,5 +1,5 @@
 """Standard output that can't take what a command prints: another encoding, a full disk, a reader
-that is gone.
+that is gone, a stream that is closed.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ import errno
 import io
 import os
 import sys
+from pathlib import Path
 
 import click
 
@@ -18,8 +19,14 @@ def prepare() -> None:
     """Lets text from outside pass that the encoding of standard output does not have.
 
     Files and pipes on Windows get UTF-8, which Holdfast requires of all that it reads, unless the
-    user demands another encoding.
+    user demands another encoding. Standard streams that are closed, as by `2>&-`, are replaced.
     """
+    # In the order of their descriptors: each is the lowest that is free. A socket that took the
+    # place of one would get what native code prints.
+    nowhere = Path(os.devnull)
+    sys.stdin = sys.stdin or nowhere.open(encoding="utf-8")
+    sys.stdout = sys.stdout or nowhere.open("w", encoding="utf-8")
+    sys.stderr = sys.stderr or nowhere.open("w", encoding="utf-8")
     is_local = sys.platform == "win32" and not os.environ.get("PYTHONIOENCODING")
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
