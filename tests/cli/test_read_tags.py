@@ -139,6 +139,8 @@ def test_a_device_of_a_configuration_is_read_by_its_name(
     assert "has no device 'metre'" in usage_error("read", "metre", *config)
     profile = ("--tags", str(file), "--profile", "kind", "--only", "pump")
     assert answer("read", cli.url(server), *profile)["values"] == {"pump": True}
+    alone = usage_error("read", cli.url(server), "--tags", str(file))
+    assert f"{file} is a configuration, not a tag list: add --profile NAME" in alone
     wrong = usage_error("read", cli.url(server), "--tags", str(file), "--profile", "kin")
     assert "has no profile 'kin', allowed: kind; did you mean 'kind'?" in wrong
 
@@ -173,10 +175,11 @@ def test_a_tag_whose_address_is_a_modicon_number_has_a_hint(
     file = tmp_path / "device.csv"
     file.write_text("flow,hr,41001,,,,,,yes\n")
     url, hint = cli.url(server), "addresses count from 0; as a Modicon number 41001 is hr:1000"
-    for arguments in (("read", url), ("write", url, "flow=1")):
+    then = f"'holdfast describe map {url}'", "the address does not exist, or may not be written"
+    for arguments, more in zip((("read", url), ("write", url, "flow=1")), then, strict=True):
         result = invoke(*arguments, "--tags", str(file))
         assert result.exit_code == 1
-        assert f"hint: {hint}\nhint: 'holdfast describe map {url}'" in result.stderr
+        assert f"hint: {hint}\nhint: {more}" in result.stderr
 
 
 def test_a_hint_is_printed_once_for_all_tags_and_readings() -> None:

@@ -175,7 +175,8 @@ def test_a_refusal_is_told(server: holdfast.Server) -> None:
     url = cli.url(server)
     assert failure("write", url, "hr", "1000", "1") == [
         f"holdfast: {url}: exception 02 (Illegal Data Address)",
-        f"hint: 'holdfast describe map {url}' finds the addresses that exist",
+        "hint: the address does not exist, or may not be written; if Holdfast serves it, see "
+        "'holdfast check FILE --as ADDRESS', and 'writes' of the device in FILE",
     ]
     found = answer("write", url, "hr", "1000", "1", code=1)
     assert (found["ok"], found["code"], found["maybe_written"]) == (False, 2, False)

@@ -83,21 +83,31 @@ HINTS = {
 }
 """What to do after an exception of a device at a URL, by its code."""
 
+WRITE_HINTS = {
+    **HINTS,
+    ILLEGAL_ADDRESS: (
+        "the address does not exist, or may not be written; if Holdfast serves it, see "
+        "'holdfast check FILE --as ADDRESS', and 'writes' of the device in FILE"
+    ),
+}
+"""The same after a write."""
 
-def hint(error: object, url: str, absent: str | None = None) -> None:
+
+def hint(error: object, url: str, absent: str | None = None, *, is_write: bool = False) -> None:
     """Prints what to do after an error, or the code of an exception, once in a command.
 
     `absent` is what to say first of an address that does not exist.
     """
+    hints = WRITE_HINTS if is_write else HINTS
     code = error.code if isinstance(error, ModbusException) else error
-    if not isinstance(code, int) or code not in HINTS:
+    if not isinstance(code, int) or code not in hints:
         return
     told: set[int] = click.get_current_context().meta.setdefault(f"{__name__}.told", set())
     if code not in told:
         told.add(code)
         if code == ILLEGAL_ADDRESS and absent is not None:
             click.echo(f"hint: {absent}", err=True)
-        click.echo(f"hint: {HINTS[code].format(url)}", err=True)
+        click.echo(f"hint: {hints[code].format(url)}", err=True)
 
 
 def hint_at_late_replies(longest: float, timeout: float) -> None:
@@ -126,6 +136,7 @@ def fail(
     *,
     where: str | None = None,
     is_in_area: bool = True,
+    is_write: bool = False,
 ) -> NoReturn:
     """Prints an error and hints, `first` before others, and exits with 1.
 
@@ -140,5 +151,5 @@ def fail(
         click.echo(f"hint: {first}", err=True)
     is_absent = isinstance(error, ModbusException) and error.code == ILLEGAL_ADDRESS
     if is_in_area or not is_absent:  # A search of addresses finds no files and queues.
-        hint(error, url)
+        hint(error, url, is_write=is_write)
     sys.exit(ExitCode.FAILED)

@@ -164,7 +164,9 @@ def _carry_out(
             written = {"written": found.written} if isinstance(found, ModbusError) else {}
             shown = {**fields, **written, "maybe_written": maybe} if as_json else None
             first = f"{job.where} was possibly written" if maybe else None
-            device_errors.fail(error, url, shown, first, is_in_area=isinstance(job, _Job))
+            device_errors.fail(
+                error, url, shown, first, is_in_area=isinstance(job, _Job), is_write=True
+            )
         try:
             differing = job.differing(client) if verify else {}
         except ModbusError as error:

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
     from holdfast.tags import TagList
 
+CONFIGURATION = ("memories", "listeners", "profiles", "devices")
+"""Keys of a configuration that no tag list has."""
+
 
 def configured(file: Path, name: str, unit: int, timeout: float) -> TaggedDevice:
     """A device of a configuration. Exits for an invalid file."""
@@ -45,6 +48,12 @@ def tags_of(file: Path, profile: str | None) -> TagList:
         try:
             return load_tags(file)
         except ConfigError as error:
+            if any(problem.key in CONFIGURATION for problem in error.problems):
+                raise click.UsageError(
+                    f"{file} is a configuration, not a tag list: add --profile NAME for the tags "
+                    f"of a profile; or, for a device, give its name in place of URL, and "
+                    f"--config {file} in place of --tags."
+                ) from None
             show_problems(error)
             raise SystemExit(ExitCode.WRONG) from None
     from holdfast.cli.configuration import load_or_exit

@@ -144,7 +144,7 @@ def _fail(
     click.echo(f"holdfast: {of.url}: {names[at]}: {error}", err=True)
     if maybe:
         click.echo(f"hint: {names[at]} was possibly written", err=True)
-    device_errors.hint(error, of.url, modicon_hint(writes[at].tag))
+    device_errors.hint(error, of.url, modicon_hint(writes[at].tag), is_write=True)
     _print_not_written(writes[at + 1 :])
     sys.exit(ExitCode.FAILED)
 
