@@ -4,6 +4,8 @@ use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 use std::time::Duration;
 
+use holdfast_protocol::client::Failure;
+use holdfast_protocol::pdu::ExceptionCode;
 use tokio::sync::{RwLock, RwLockReadGuard, RwLockWriteGuard, Semaphore, SemaphorePermit, oneshot};
 use tokio::time::Instant;
 
@@ -26,7 +28,8 @@ const RETRY_AFTER: Duration = Duration::from_secs(300);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InFlight {
     Fixed(u16),
-    /// More while round trips stay as short as those of single requests; after a timeout, one.
+    /// More while round trips stay as short as those of single requests. After a timeout, one; and after
+    /// another failure with which devices refuse a second request while they carry out the first.
     Auto,
 }
 
@@ -59,6 +62,12 @@ pub(in crate::link) type Alone<'p> = (Free, RwLockWriteGuard<'p, ()>);
 
 /// A place, which is given back when it is dropped.
 pub(in crate::link) struct Free(Option<Rc<Places>>);
+
+/// When a request was sent, and whether it was the only one in flight.
+pub(in crate::link) struct Began {
+    at: Instant,
+    is_alone: bool,
+}
 
 struct Auto {
     limit: usize,
@@ -106,15 +115,33 @@ impl Pace {
         place.await.expect("places outlive those who wait for one")
     }
 
-    /// The time, if the round trips of requests matter.
-    pub(in crate::link) fn began(&self) -> Option<Instant> {
-        self.auto.as_ref().map(|_| Instant::now())
+    /// The start of a request, if its round trip matters.
+    pub(in crate::link) fn began(&self) -> Option<Began> {
+        self.auto.as_ref().map(|_| Began { at: Instant::now(), is_alone: self.is_alone() })
     }
 
-    /// A request that began then has ended.
-    pub(in crate::link) fn ended(&self, began: Instant, timed_out: bool) {
+    /// A request that has a place has ended.
+    pub(in crate::link) fn ended(&self, began: Began, answer: &Result<Vec<u8>, Failure>) {
+        const REFUSALS: [u8; 2] =
+            [ExceptionCode::Acknowledge as u8, ExceptionCode::ServerDeviceBusy as u8];
         let now = Instant::now();
-        if timed_out { self.timed_out(now) } else { self.answered(now - began, now) }
+        let is_alone = began.is_alone && self.is_alone();
+        match answer {
+            Err(Failure::Timeout) => self.too_many(now),
+            Err(Failure::Exception(code)) if is_alone || !REFUSALS.contains(code) => {
+                self.answered(now - began.at, now);
+            }
+            Ok(_) => self.answered(now - began.at, now),
+            Err(_) if is_alone => {}
+            Err(_) => self.too_many(now),
+        }
+    }
+
+    /// Whether no more than one place is taken.
+    fn is_alone(&self) -> bool {
+        let Some(auto) = &self.auto else { return false };
+        let places = auto.borrow().limit + self.places.owed.get();
+        places <= self.places.free.get() + 1
     }
 
     fn answered(&self, took: Duration, now: Instant) {
@@ -127,7 +154,7 @@ impl Pace {
         }
     }
 
-    fn timed_out(&self, now: Instant) {
+    fn too_many(&self, now: Instant) {
         if let Some(auto) = &self.auto {
             let fewer = auto.borrow_mut().back_to(1, now);
             self.take_away(fewer);
@@ -226,6 +253,8 @@ impl Auto {
 
 #[cfg(test)]
 mod tests {
+    use holdfast_protocol::client::{Closed, InvalidResponse};
+
     use super::*;
 
     const MS: Duration = Duration::from_millis(1);
@@ -286,9 +315,34 @@ mod tests {
             }
             taken.push(pace.place(0, Priority::Usual).await);
         }
-        pace.timed_out(now);
+        pace.too_many(now);
         drop(taken);
         assert_eq!((pace.places.free.get(), pace.places.owed.get()), (1, 0));
+    }
+
+    #[tokio::test]
+    async fn failures_take_places_only_beside_other_requests_and_are_no_round_trips() {
+        let lost = Failure::Closed(Closed::ByPeer);
+        let damaged = Failure::Invalid(InvalidResponse::ProtocolId(1));
+        for failure in [Failure::Exception(5), Failure::Exception(6), lost, damaged] {
+            let pace = Pace::new(InFlight::Auto);
+            let limit = || pace.auto.as_ref().unwrap().borrow().limit;
+            let first = pace.place(0, Priority::Usual).await;
+            for _ in 0..ANSWERS_PER_DECISION {
+                pace.answered(10 * MS, Instant::now());
+            }
+            for _ in 0..3 * ANSWERS_PER_DECISION {
+                pace.ended(pace.began().unwrap(), &Err(failure));
+            }
+            assert_eq!(limit(), 2, "{failure}: it was alone");
+            let second = pace.place(0, Priority::Usual).await;
+            let began = pace.began().unwrap();
+            drop(first);
+            pace.ended(began, &Err(failure));
+            assert_eq!(limit(), 1, "{failure}");
+            drop(second);
+            assert_eq!((pace.places.free.get(), pace.places.owed.get()), (1, 0));
+        }
     }
 
     #[tokio::test]

@@ -140,11 +140,12 @@ impl TcpLink {
             permit.check()?;
             let began = pace.began();
             let outcome = self.carry_out(unit_id, request, deadline, attempt, permit.until).await;
-            let Some((answer, again)) = outcome.map_err(failed)? else {
+            let Some((answer, again)) = outcome.unwrap_or_else(|lost| Some((Err(lost), None)))
+            else {
                 return Err(Arc::new(ClientError::Expired));
             };
             if let Some(began) = began {
-                pace.ended(began, answer == Err(Failure::Timeout));
+                pace.ended(began, &answer);
             }
             let Some(next) = again else { return answer.map_err(failed) };
             sleep(next.pause()).await;
