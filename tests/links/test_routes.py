@@ -735,6 +735,32 @@ def test_reads_of_preferred_clients_and_writes_go_first(
     assert [asked.pdu for asked in device.requests] == [READ, WRITE, eight, seven]
 
 
+@pytest.mark.parametrize(
+    ("source", "order"), [("127.0.0.2", "eab"), ("127.0.0.1", "aeb")], ids=["preferred", "usual"]
+)
+def test_a_read_that_joins_an_equal_one_waits_no_longer_than_alone(
+    device: Stream, run: Run, connect: Connect, source: str, order: str
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, link={"priority": {"127.0.0.2": "high"}}))
+    first, many = connect(scada(appliance)), connect(scada(appliance))
+    other = connect(scada(appliance), source=source)
+    reads = {name: bytes.fromhex(f"0300{name * 2}0001") for name in "abe"}
+    first.send(wire.frame(READ))
+    device.await_requests(1)
+    for number, pdu in enumerate(reads.values()):
+        many.send(wire.frame(pdu, transaction=number))
+    await_count(appliance, "waiting", 4)
+    other.send(wire.frame(reads["e"]))
+    await_count(appliance, "coalesced", 1)
+    held.release()
+
+    assert [many.receive().transaction for _ in reads] == [0, 1, 2]
+    assert other.receive().pdu == bytes.fromhex("030200ee")
+    assert [asked.pdu for asked in device.requests] == [READ, *(reads[name] for name in order)]
+
+
 # Audit
 
 

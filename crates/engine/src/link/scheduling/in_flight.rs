@@ -111,7 +111,8 @@ impl Pace {
             return place;
         }
         let (sender, place) = oneshot::channel();
-        self.places.waiting.borrow_mut().push(source, priority, sender);
+        let is_awaited = |sender: &oneshot::Sender<Free>| !sender.is_closed();
+        self.places.waiting.borrow_mut().push(source, priority, sender, is_awaited);
         place.await.expect("places outlive those who wait for one")
     }
 

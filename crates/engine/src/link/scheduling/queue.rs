@@ -72,12 +72,26 @@ impl<T> Default for Queue<T> {
 }
 
 impl<T> Queue<T> {
-    pub(in crate::link) fn push(&mut self, source: u64, priority: Priority, item: T) {
+    /// Items of the source that are not `awaited` any more may be dropped.
+    pub(in crate::link) fn push(
+        &mut self,
+        source: u64,
+        priority: Priority,
+        item: T,
+        awaited: impl Fn(&T) -> bool,
+    ) {
         // Writes go in the order of their arrival: as if all came from one source.
         let source = if priority == Priority::Urgent { 0 } else { source };
         let sources = &mut self.ranks[priority.rank()];
         match sources.iter_mut().find(|(other, _)| *other == source) {
-            Some((_, items)) => items.push_back(item),
+            Some((_, items)) => {
+                if items.len() == items.capacity() {
+                    items.retain(awaited);
+                    // Room for as many more: they are not looked at for each item.
+                    items.reserve(items.len() + 1);
+                }
+                items.push_back(item);
+            }
             None => sources.push_back((source, VecDeque::from([item]))),
         }
     }
@@ -114,7 +128,7 @@ mod tests {
     fn sources_take_turns() {
         let mut queue = Queue::default();
         for (source, item) in [(1, "a1"), (1, "a2"), (1, "a3"), (2, "b1"), (3, "c1"), (2, "b2")] {
-            queue.push(source, Priority::Usual, item);
+            queue.push(source, Priority::Usual, item, |_| true);
         }
         assert_eq!(all(&mut queue), ["a1", "b1", "c1", "a2", "b2", "a3"]);
     }
@@ -122,10 +136,10 @@ mod tests {
     #[test]
     fn writes_go_first_in_the_order_of_their_arrival() {
         let mut queue = Queue::default();
-        queue.push(1, Priority::Usual, "read");
-        queue.push(2, Priority::Preferred, "preferred read");
+        queue.push(1, Priority::Usual, "read", |_| true);
+        queue.push(2, Priority::Preferred, "preferred read", |_| true);
         for (source, item) in [(1, "w1"), (1, "w2"), (2, "w3")] {
-            queue.push(source, Priority::Urgent, item);
+            queue.push(source, Priority::Urgent, item, |_| true);
         }
         assert_eq!(all(&mut queue), ["w1", "w2", "w3", "preferred read", "read"]);
     }
@@ -133,14 +147,25 @@ mod tests {
     #[test]
     fn no_rank_starves() {
         let mut queue = Queue::default();
-        queue.push(1, Priority::Usual, "read");
-        queue.push(2, Priority::Preferred, "preferred read");
+        queue.push(1, Priority::Usual, "read", |_| true);
+        queue.push(2, Priority::Preferred, "preferred read", |_| true);
         for _ in 0..20 {
-            queue.push(3, Priority::Urgent, "write");
+            queue.push(3, Priority::Urgent, "write", |_| true);
         }
         let order = all(&mut queue);
         assert_eq!(order.iter().position(|item| *item == "preferred read"), Some(4));
         assert_eq!(order.iter().position(|item| *item == "read"), Some(5));
+    }
+
+    #[test]
+    fn items_that_nobody_waits_for_do_not_add_up() {
+        let mut queue = Queue::default();
+        for item in 0..1000 {
+            queue.push(1, Priority::Usual, item, |waiting| item - waiting < 10);
+        }
+        let (_, items) = &queue.ranks[Priority::Usual.rank()][0];
+        assert!(items.len() < 100);
+        assert!((990..1000).all(|item| items.contains(&item)));
     }
 
     proptest! {
@@ -152,7 +177,7 @@ mod tests {
             let mut queue = Queue::default();
             let mut popped = Vec::new();
             for (number, (source, rank, pop)) in pushed.iter().enumerate() {
-                queue.push(*source, ranks[*rank], (*source, *rank, number));
+                queue.push(*source, ranks[*rank], (*source, *rank, number), |_| true);
                 popped.extend(pop.then(|| queue.pop()).flatten());
             }
             popped.extend(std::iter::from_fn(|| queue.pop()));

@@ -66,10 +66,15 @@ impl Serving {
         let Some(reply) = self.admitted(unit_id, &request, vec![reply], counters).pop() else {
             return;
         };
-        let Some(joining) = self.reads.join(read.clone(), reply) else {
-            return counters.coalesced.add();
+        let joining = self.reads.join(read.clone(), reply);
+        if joining.joins {
+            counters.coalesced.add();
+        }
+        let turn = tokio::select! {
+            biased;
+            () = joining.sent() => return,
+            turn = self.link.turn(source, priority) => turn,
         };
-        let turn = self.link.turn(source, priority).await;
         let replies = joining.leave();
         if replies.iter().all(Reply::is_unwanted) {
             return counters.withdrawn.add();

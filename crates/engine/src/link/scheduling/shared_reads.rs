@@ -3,9 +3,11 @@
 
 use std::cell::RefCell;
 use std::collections::HashMap;
+use std::rc::Rc;
 use std::time::Duration;
 
 use holdfast_protocol::pdu::EncodedRequest;
+use tokio::sync::Notify;
 use tokio::time::Instant;
 
 use crate::link::route::Reply;
@@ -18,13 +20,20 @@ pub(in crate::link) struct SharedReads {
     coalesce: bool,
     /// How long a reply answers equal reads.
     keep: Duration,
-    /// Reads that wait for their turn, with the replies to equal ones that came later.
-    waiting: RefCell<HashMap<Read, Vec<Reply>>>,
+    waiting: RefCell<HashMap<Read, Rc<Equal>>>,
     cached: RefCell<HashMap<Read, Cached>>,
 }
 
 /// A read that equal ones can share a reply with: its unit id and PDU.
 pub(in crate::link) type Read = (u8, Box<[u8]>);
+
+/// Equal reads. Each waits for a turn of its own, so that none waits longer than without the others; the
+/// first to have it is sent for all.
+#[derive(Default)]
+struct Equal {
+    replies: RefCell<Vec<Reply>>,
+    sent: Notify,
+}
 
 struct Cached {
     pdu: Vec<u8>,
@@ -43,18 +52,16 @@ impl SharedReads {
         SharedReads { coalesce, keep, waiting: RefCell::default(), cached: RefCell::default() }
     }
 
-    /// Adds the reply to an equal read that waits, and returns `None`; without one, returns a `Joining`.
-    pub(in crate::link) fn join(&self, read: Option<Read>, reply: Reply) -> Option<Joining<'_>> {
-        let Some(read) = read.filter(|_| self.coalesce) else {
-            return Some(Joining { reads: self, read: None, first: Some(reply) });
+    /// Lets a request wait with equal reads, if it is a read.
+    pub(in crate::link) fn join(&self, read: Option<Read>, reply: Reply) -> Joining<'_> {
+        let read = read.filter(|_| self.coalesce);
+        let equal = match &read {
+            Some(read) => Rc::clone(self.waiting.borrow_mut().entry(read.clone()).or_default()),
+            None => Rc::default(),
         };
-        let mut waiting = self.waiting.borrow_mut();
-        if let Some(equal) = waiting.get_mut(&read) {
-            equal.push(reply);
-            return None;
-        }
-        waiting.insert(read.clone(), vec![reply]);
-        Some(Joining { reads: self, read: Some(read), first: None })
+        equal.replies.borrow_mut().push(reply);
+        let joins = equal.replies.borrow().len() > 1;
+        Joining { reads: self, read, equal, joins }
     }
 
     /// A valid reply to an equal read. `changes` counts requests that may have changed a device.
@@ -84,18 +91,27 @@ impl SharedReads {
     }
 }
 
-/// A request that waits for its turn, and the replies to equal ones.
+/// A request that waits for its turn.
 pub(in crate::link) struct Joining<'r> {
     reads: &'r SharedReads,
     read: Option<Read>,
-    first: Option<Reply>,
+    equal: Rc<Equal>,
+    /// Whether an equal read waited before it.
+    pub(in crate::link) joins: bool,
 }
 
 impl Joining<'_> {
+    /// Waits until an equal read is sent.
+    pub(in crate::link) async fn sent(&self) {
+        self.equal.sent.notified().await;
+    }
+
     /// The request is sent now: later equal reads are answered by another one.
-    pub(in crate::link) fn leave(mut self) -> Vec<Reply> {
-        let joined =
-            self.read.take().and_then(|read| self.reads.waiting.borrow_mut().remove(&read));
-        joined.unwrap_or_else(|| self.first.take().into_iter().collect())
+    pub(in crate::link) fn leave(self) -> Vec<Reply> {
+        if let Some(read) = &self.read {
+            self.reads.waiting.borrow_mut().remove(read);
+        }
+        self.equal.sent.notify_waiters();
+        self.equal.replies.take()
     }
 }
