@@ -568,8 +568,10 @@ def test_a_silent_unit_is_exception_0b_and_the_others_are_served(
             appliance = run(configuration(device.url, link={"timeout": timeout}))
             with wire.Connection(scada(appliance)) as other:
                 front = connect(scada(appliance))
-                for _ in range(4):
-                    assert front.ask(READ, unit=2) == exception(READ, 0x0B)
+                for number in range(4):
+                    # The last one is not sent, if the pause is not over.
+                    codes = [0x0B] if number < 3 else [0x0A, 0x0B]
+                    assert front.ask(READ, unit=2) in [exception(READ, code) for code in codes]
                     reply = other.ask(READ, unit=1)
                     if reply == exception(READ, 0x0B):
                         return False
@@ -579,6 +581,33 @@ def test_a_silent_unit_is_exception_0b_and_the_others_are_served(
             return True
 
     wire.until_long_enough(are_served, "the others have replies")
+
+
+def test_a_function_that_a_unit_is_silent_about_does_not_stop_its_others(
+    run: Run, connect: Connect
+) -> None:
+    unknown = bytes.fromhex("0400050001")
+
+    def only_writes(asked: Asked) -> None:
+        if asked.pdu == WRITE:
+            good(asked)
+
+    def is_served(timeout: float) -> bool:
+        with Stream("tcp", then=only_writes) as device:
+            appliance = run(configuration(device.url, link={"timeout": timeout}))
+            front = connect(scada(appliance))
+            for _ in range(3):
+                assert front.ask(unknown) == exception(unknown, 0x0B)
+            # Without a try, so it was not sent.
+            assert front.ask(unknown) in (exception(unknown, 0x0A), exception(unknown, 0x0B))
+            reply = front.ask(WRITE)
+            if reply == exception(WRITE, 0x0B) or not counters(appliance)["refused_down"]:
+                return False
+            assert reply == WRITE
+            assert counters(appliance)["timeouts"] == 3
+            return True
+
+    wire.until_long_enough(is_served, "the write has a reply")
 
 
 def test_a_late_reply_is_not_the_answer_to_the_next_request(run: Run, connect: Connect) -> None:

@@ -3,12 +3,14 @@
 //!
 //! A breaker opens after failures in a row, for longer each time. The first request after that is the
 //! test: a reply closes the breaker, a failure opens it again.
+//!
+//! Some devices are silent only about functions that they do not have. So the open breaker of a unit
+//! concerns only functions that have timed out since the last answer of the unit.
 
 use std::cell::{Cell, RefCell};
 use std::collections::HashMap;
 use std::time::Duration;
 
-use holdfast_protocol::pdu::ExceptionCode;
 use holdfast_runtime::Retry;
 use tokio::time::Instant;
 
@@ -22,9 +24,17 @@ const MAX_OPEN: Duration = Duration::from_secs(5);
 
 pub(in crate::link) struct CircuitBreakers {
     retry: Retry,
-    /// Without an entry, the breaker of a unit is closed.
-    units: RefCell<HashMap<u8, Breaker>>,
+    /// The breaker of each unit that is silent, and the functions that have timed out: bit N is
+    /// function N.
+    units: RefCell<HashMap<u8, (Breaker, u128)>>,
     address: Cell<Option<Breaker>>,
+}
+
+/// What can't be reached while a breaker is open.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::link) enum Down {
+    Address,
+    Unit,
 }
 
 /// Failures in a row, and until when the breaker is open because of them.
@@ -56,24 +66,23 @@ impl CircuitBreakers {
         CircuitBreakers { retry: retry.up_to(MAX_OPEN), units, address }
     }
 
-    /// Fails fast if a breaker is open.
-    ///
-    /// # Errors
-    /// The exception of a gateway (V1.1b3, 7).
-    pub(in crate::link) fn check(&self, unit_id: u8) -> Result<(), ExceptionCode> {
+    /// Whether a request must fail fast.
+    pub(in crate::link) fn check(&self, unit_id: u8, function: u8) -> Result<(), Down> {
         if self.address.get().is_some_and(|breaker| breaker.is_open()) {
-            return Err(ExceptionCode::GatewayPathUnavailable);
+            return Err(Down::Address);
         }
-        if self.units.borrow().get(&unit_id).is_some_and(Breaker::is_open) {
-            return Err(ExceptionCode::GatewayTargetFailedToRespond);
+        match self.units.borrow().get(&unit_id) {
+            Some((breaker, silent)) if silent & bit(function) != 0 && breaker.is_open() => {
+                Err(Down::Unit)
+            }
+            _ => Ok(()),
         }
-        Ok(())
     }
 
     /// Notes the outcome of a request. `is_unreachable` says that the address could not be reached.
     pub(in crate::link) fn record(
         &self,
-        unit_id: u8,
+        (unit_id, function): (u8, u8),
         answered: Result<(), Fault>,
         is_unreachable: bool,
     ) {
@@ -86,13 +95,19 @@ impl CircuitBreakers {
         let mut units = self.units.borrow_mut();
         if answered == Err(Fault::Timeout) {
             let before = units.get(&unit_id).copied();
+            let (before, silent) = before.map_or((None, 0), |(before, of)| (Some(before), of));
             let breaker = Breaker::after_failure(before, OPEN_AFTER_TIMEOUTS - 1, self.retry);
-            units.insert(unit_id, breaker);
+            units.insert(unit_id, (breaker, silent | bit(function)));
         } else {
             // An exception shows that the unit answers. Other failures say nothing about it.
             units.remove(&unit_id);
         }
     }
+}
+
+/// Requests have functions up to 127.
+fn bit(function: u8) -> u128 {
+    1 << (function & 0x7F)
 }
 
 #[cfg(test)]
@@ -101,28 +116,46 @@ mod tests {
 
     const SILENT: Result<(), Fault> = Err(Fault::Timeout);
 
+    /// The breakers after timeouts of function 3 that open the breaker of unit 7.
+    fn silent() -> CircuitBreakers {
+        let breakers = CircuitBreakers::new(Retry::default());
+        for _ in 0..OPEN_AFTER_TIMEOUTS {
+            assert_eq!(breakers.check(7, 3), Ok(()));
+            breakers.record((7, 3), SILENT, false);
+        }
+        breakers
+    }
+
     #[test]
     fn the_breaker_of_a_unit_opens_after_some_timeouts_and_those_of_others_do_not() {
-        let breakers = CircuitBreakers::new(Retry::default());
-        for _ in 1..OPEN_AFTER_TIMEOUTS {
-            breakers.record(7, SILENT, false);
-            assert_eq!(breakers.check(7), Ok(()));
-        }
-        breakers.record(7, SILENT, false);
-        assert_eq!(breakers.check(7), Err(ExceptionCode::GatewayTargetFailedToRespond));
-        assert_eq!(breakers.check(8), Ok(()));
         for answer in [Ok(()), Err(Fault::Exception(2))] {
-            breakers.record(7, answer, false);
-            assert_eq!(breakers.check(7), Ok(()));
+            let breakers = silent();
+            assert_eq!(breakers.check(7, 3), Err(Down::Unit));
+            assert_eq!(breakers.check(8, 3), Ok(()));
+            breakers.record((7, 3), answer, false);
+            assert_eq!(breakers.check(7, 3), Ok(()));
+        }
+    }
+
+    #[test]
+    fn a_function_is_tried_until_it_has_timed_out_too() {
+        let breakers = silent();
+        assert_eq!(breakers.check(7, 6), Ok(()));
+        breakers.record((7, 6), SILENT, false);
+        assert_eq!(breakers.check(7, 6), Err(Down::Unit));
+        assert_eq!(breakers.check(7, 16), Ok(()));
+        breakers.record((7, 16), Ok(()), false);
+        for function in [3, 6, 16] {
+            assert_eq!(breakers.check(7, function), Ok(()), "the unit answers");
         }
     }
 
     #[test]
     fn the_breaker_of_an_address_that_can_not_be_reached_opens_at_once() {
         let breakers = CircuitBreakers::new(Retry::default());
-        breakers.record(7, Err(Fault::Refused), true);
-        assert_eq!(breakers.check(8), Err(ExceptionCode::GatewayPathUnavailable));
-        breakers.record(8, Ok(()), false);
-        assert_eq!(breakers.check(7), Ok(()));
+        breakers.record((7, 3), Err(Fault::Refused), true);
+        assert_eq!(breakers.check(8, 6), Err(Down::Address));
+        breakers.record((8, 3), Ok(()), false);
+        assert_eq!(breakers.check(7, 3), Ok(()));
     }
 }

@@ -12,7 +12,7 @@ use tokio::task::spawn_local;
 use crate::client::ClientError;
 use crate::link::access::Link;
 use crate::link::fault::{Exchanged, Fault, exception, exception_code, fault};
-use crate::link::limits::circuit_breaker::CircuitBreakers;
+use crate::link::limits::circuit_breaker::{CircuitBreakers, Down};
 use crate::link::limits::permit::Permit;
 use crate::link::route::{Call, LinkCounters, LinkSettings, Reply, SharedLink};
 use crate::link::scheduling::shared_reads::{SharedReads, shareable};
@@ -91,7 +91,8 @@ impl Serving {
         let answered =
             self.link.exchange(unit_id, &request, timeout, true, &Permit::default()).await;
         drop(turn);
-        self.record(unit_id, &answered, replies.iter().any(Reply::is_of_listener));
+        let from_listener = replies.iter().any(Reply::is_of_listener);
+        self.record((unit_id, request.pdu()[0]), &answered, from_listener);
         let error = match answered {
             Ok(pdu) => {
                 counters.replies.add();
@@ -124,10 +125,11 @@ impl Serving {
         replies: Vec<Reply>,
         counters: &LinkCounters,
     ) -> Vec<Reply> {
-        let Err(code) = self.breakers.check(unit_id) else { return replies };
-        let pdu = exception(request.pdu(), code.code());
+        let Err(down) = self.breakers.check(unit_id, request.pdu()[0]) else { return replies };
+        // Not 0B, after which a write may have been carried out: nothing was sent.
+        let pdu = exception(request.pdu(), ExceptionCode::GatewayPathUnavailable.code());
         let error = self.error.borrow();
-        let error = error.as_ref().filter(|_| code == ExceptionCode::GatewayPathUnavailable);
+        let error = error.as_ref().filter(|_| down == Down::Address);
         let mut admitted = Vec::new();
         let mut is_refused = false;
         for reply in replies {
@@ -149,7 +151,7 @@ impl Serving {
 
     /// Notes the outcome for the breakers. The timeouts of event loops alone say nothing about a unit: they
     /// may be short.
-    fn record(&self, unit_id: u8, answered: &Exchanged, from_listener: bool) {
+    fn record(&self, of: (u8, u8), answered: &Exchanged, from_listener: bool) {
         let is_unreachable = self.link.retry_at().is_some();
         if let Err(error) = answered
             && is_unreachable
@@ -158,7 +160,7 @@ impl Serving {
         }
         let outcome = answered.as_ref().map(drop).map_err(|error| fault(error));
         if outcome != Err(Fault::Timeout) || from_listener || is_unreachable {
-            self.breakers.record(unit_id, outcome, is_unreachable);
+            self.breakers.record(of, outcome, is_unreachable);
         }
     }
 }
