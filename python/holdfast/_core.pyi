@@ -1388,6 +1388,13 @@ class Link:
     def name(self) -> str:
         """The name that it was created with."""
 
+    @property
+    def error(self) -> str | None:
+        """Why requests fail: its address can't be reached, or several had no answer.
+
+        `None` while something behind it answers.
+        """
+
     def route(self, name: str, *, timeout: float, unit: int | None = None) -> Route:
         """A target for the units of a `Rule`: their requests go to `unit` of this link.
 

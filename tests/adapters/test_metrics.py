@@ -178,7 +178,7 @@ def devices() -> Devices:
         }
     )
     made.poller = polled
-    bus: Any = SimpleNamespace(counters=lambda: LINK)
+    bus: Any = SimpleNamespace(counters=lambda: LINK, error=None)
     made._links = {"bus": bus}
     return made
 

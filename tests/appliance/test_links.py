@@ -9,9 +9,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from holdfast.adapters.rest.operations import document
+from holdfast.events import log_lines
 from support import web, wire
-from support.fake_device import Stream, exception
-from support.routed import await_count, configuration, counters
+from support.fake_device import Stream, exception, silent
+from support.routed import Held, await_count, configuration, counters
 from support.running import endpoint
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from support.running import Run
 
 READ = bytes.fromhex("0300050001")
+FIVE = bytes.fromhex("03020005")
 NONE = dict.fromkeys(
     (
         "requests",
@@ -41,13 +43,26 @@ NONE = dict.fromkeys(
         "floods",
     ),
     0,
-)
+) | {"error": None}
 
 
 @pytest.fixture
 def device() -> Iterator[Stream]:
     with Stream("tcp") as made:
         yield made
+
+
+@pytest.fixture
+def records(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> Iterator[web.Records]:
+    """What is logged; changes of links at once, not only once a second."""
+    monkeypatch.setattr("holdfast.appliance.appliance.CHECK_INTERVAL_S", 0.0)
+    handler = web.Records()
+    log_lines.LOGGER.addHandler(handler)
+    with caplog.at_level("INFO"):
+        yield handler
+    log_lines.LOGGER.removeHandler(handler)
 
 
 def ask(appliance: Appliance, pdu: bytes, unit: int = 1) -> bytes:
@@ -98,6 +113,55 @@ def test_an_appliance_without_routes_has_no_links(run: Run) -> None:
         "units: {1: plant}}]}}\n"
     )
     assert appliance.diagnostics.stats()["links"] == {}
+
+
+def test_the_log_has_why_a_link_fails_once_and_that_it_works_again(
+    run: Run, records: web.Records
+) -> None:
+    def logged() -> list[str]:
+        appliance.log_events(timeout=0)
+        return [entry["event"] for entry in records.fields if entry.get("link") == "bus"]
+
+    with Stream("tcp") as device:
+        device.stop()
+        appliance = run(configuration(device.url))
+        assert logged() == []
+        for _ in range(2):
+            assert ask(appliance, READ) == exception(READ, 0x0A)
+            assert logged() == ["link_down"]
+        [down] = records.of("link_down")
+        assert device.url in down["error"]
+        assert counters(appliance)["error"] == down["error"]
+        device.start()
+        wire.until(lambda: ask(appliance, READ) == FIVE, "the device is asked again")
+        assert logged() == ["link_down", "link_back"]
+        assert counters(appliance)["error"] is None
+
+
+def test_the_log_has_that_a_device_does_not_answer(run: Run, records: web.Records) -> None:
+    with Stream("tcp", then=silent) as device:
+        appliance = run(configuration(device.url, link={"timeout": 0.1}))
+        for number in range(3):
+            assert ask(appliance, READ, unit=number) == exception(READ, 0x0B)
+            appliance.log_events(timeout=0)
+            assert len(records.of("link_down")) == number // 2
+
+
+def test_the_log_has_that_a_queue_was_full(device: Stream, run: Run, records: web.Records) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, link={"queue": 1}))
+    with wire.Connection(endpoint(appliance, "scada")) as first:
+        first.send(wire.frame(READ))
+        device.await_requests(1)
+        with wire.Connection(endpoint(appliance, "scada")) as second:
+            assert second.ask(READ) == exception(READ, 6)
+        for _ in range(2):
+            appliance.log_events(timeout=0)
+        held.release()
+        assert first.receive().pdu == FIVE
+
+    assert [(each["link"], each["count"]) for each in records.of("link_full")] == [("bus", 1)]
 
 
 def test_rest_tells_the_counters_as_it_describes_them(device: Stream, run: Run) -> None:

@@ -99,6 +99,11 @@ impl Link {
         &self.core.name
     }
 
+    #[getter]
+    fn error(&self) -> Option<String> {
+        self.core.error().map(|error| error.to_string())
+    }
+
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let all = self.core.counters.by_name().into_py_dict(py)?;
         all.set_item("waiting", self.core.waiting())?;

@@ -2,13 +2,13 @@
 
 use std::net::IpAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 
 use holdfast_protocol::client::Tolerance;
 use holdfast_protocol::frame::rtu_stream::is_one_request;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
-use holdfast_runtime::Retry;
+use holdfast_runtime::{Retry, lock};
 use tokio::sync::mpsc;
 
 use super::caller::{Caller, Waiting};
@@ -78,6 +78,7 @@ pub struct SharedLink {
     calls: mpsc::UnboundedSender<Call>,
     queue: Arc<QueueShare>,
     strays: OnceLock<Arc<StrayCounters>>,
+    error: Mutex<Option<Arc<ClientError>>>,
     preferred: Vec<IpAddr>,
     tolerance: Tolerance,
     has_rtu_frames: bool,
@@ -137,6 +138,7 @@ impl SharedLink {
             calls,
             queue: QueueShare::new(settings.queue),
             strays: OnceLock::new(),
+            error: Mutex::default(),
             preferred: settings.preferred.clone(),
             tolerance: settings.endpoint.tolerance,
             has_rtu_frames: settings.endpoint.place.transport().has_rtu_frames(),
@@ -152,6 +154,16 @@ impl SharedLink {
     /// What its connection has received without a request, or late; `None` until the link is served.
     pub fn strays(&self) -> Option<&StrayCounters> {
         self.strays.get().map(|strays| &**strays)
+    }
+
+    /// Why requests fail: the address can't be reached, or several in a row had no answer, for a while. `None`
+    /// while something behind the link answers.
+    pub fn error(&self) -> Option<Arc<ClientError>> {
+        lock(&self.error).clone()
+    }
+
+    pub(super) fn set_error(&self, error: Option<&Arc<ClientError>>) {
+        *lock(&self.error) = error.cloned();
     }
 
     /// Requests that wait or are in flight, without those of the poller.

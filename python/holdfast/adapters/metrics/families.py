@@ -329,7 +329,7 @@ def _device_metrics(devices: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric
     yield from (forward, stale, since)
 
 
-def _link_metrics(links: Mapping[str, Mapping[str, int]]) -> Iterator[Metric]:
+def _link_metrics(links: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
     requests = _counter("link_requests", "Requests of listeners, by outcome.", "link", "outcome")
     for name, stats in links.items():
         _add(requests, name, {outcome: stats[outcome] for outcome in LINK_OUTCOMES})

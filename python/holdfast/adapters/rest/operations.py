@@ -126,7 +126,7 @@ _STATS = json.loads(
      "links": {"bus_1": {"requests": 5000, "replies": 4100, "exceptions": 3, "timeouts": 2,
         "failures": 0, "refused_full": 0, "refused_down": 1, "coalesced": 896, "cached": 0,
         "withdrawn": 0, "waiting": 1, "unexpected_replies": 0, "stray_bytes": 0,
-        "late_replies": 1, "raised_timeouts": 0, "floods": 0}},
+        "late_replies": 1, "raised_timeouts": 0, "floods": 0, "error": null}},
      "adapters": {"rest": {"state": "running", "restarts": 0, "last_error": null, "accepted": 120,
         "values": 360, "reads": 4, "refused": {"invalid_value": 1}}},
      "events_lost": 0, "log_dropped": 0, "tag_polls_dropped": 0,

@@ -103,6 +103,7 @@ _LINK = object_of(
         "late_replies": COUNT,
         "raised_timeouts": count("Requests with more than their timeout"),
         "floods": count("Pauses because of stray bytes"),
+        "error": TEXT_OR_NULL,
     }
 )
 _ADAPTER = object_of(

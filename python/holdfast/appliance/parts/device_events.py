@@ -29,9 +29,12 @@ class DeviceEvents:
         self._strays: dict[tuple[str, str, str], tuple[int, float]] = {}
         self._forwarded: dict[tuple[str, int], Mapping[str, Any]] = {}
         self._unreachable: set[tuple[str, int]] = set()
+        self._down: set[str] = set()
+        self._full: dict[str, int] = {}
 
-    def replace(self, gone: Iterable[str], polled: Collection[str]) -> None:
-        """Forgets devices that are gone, or polled with other settings from now on."""
+    def replace(self, gone: Iterable[str], polled: Collection[str], links: Collection[str]) -> None:
+        """Forgets devices that are gone or polled with other settings, and all but these links."""
+        self._down &= set(links)
         names = {*gone, *polled}
         for known in (self.health, self._plan_errors):
             for name in names & known.keys():
@@ -67,6 +70,19 @@ class DeviceEvents:
             usual = health in ("ok", "standby")
             log_lines.write(logging.INFO if usual else logging.WARNING, "device_health", **fields)
         self.log_strays("device", name, counted)
+
+    def log_link(self, name: str, counted: Mapping[str, int], error: str | None) -> None:
+        """Logs that requests of a link begin to fail, that they no longer do, and a full queue."""
+        if error is not None and name not in self._down:
+            self._down.add(name)
+            log_lines.write(logging.WARNING, "link_down", link=name, error=error)
+        elif error is None and name in self._down:
+            self._down.discard(name)
+            log_lines.write(logging.INFO, "link_back", link=name)
+        refused = counted["refused_full"] - self._full.get(name, 0)
+        if refused > 0:
+            log_lines.refused("link_full", kind=name, link=name, count=refused)
+        self._full[name] = counted["refused_full"]
 
     def log_strays(self, kind: str, name: str, counted: Mapping[str, int]) -> None:
         """Logs that a device or link has begun to send unrequested data, or late replies only."""

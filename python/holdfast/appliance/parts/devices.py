@@ -115,7 +115,8 @@ class Devices(Part):
             if values is not None:
                 values.have_begun(replaced)
             self._polled = polled
-            self._events.replace(gone, made)
+            changed = {key.partition(".")[2] for key in plan.changed}
+            self._events.replace(gone, made, self._links.keys() - changed)
 
         return adopt
 
@@ -141,8 +142,10 @@ class Devices(Part):
         for name, counted in self._counters().items():
             self._events.log_device(name, counted, self.config.devices[name].forward)
         for name, link in self._links.items():
+            counted = link.counters()
+            self._events.log_link(name, counted, link.error)
             if name not in self.config.devices:
-                self._events.log_strays("link", name, link.counters())
+                self._events.log_strays("link", name, counted)
 
     def heartbeats(self) -> list[ThreadHeartbeat]:
         """The heartbeats of the poller and of the thread that takes values."""
@@ -158,7 +161,9 @@ class Devices(Part):
         aging = self._mirrors.status()
         for name in found.keys() & aging.keys():
             found[name]["mirrors"] = aging[name]
-        links = {name: link.counters() for name, link in self._links.items()}
+        links = {
+            name: {**link.counters(), "error": link.error} for name, link in self._links.items()
+        }
         dropped = 0 if self.values is None else self.values.dropped
         return {"devices": found, "links": links, "tag_polls_dropped": dropped}
 

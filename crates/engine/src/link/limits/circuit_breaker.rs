@@ -17,7 +17,7 @@ use tokio::time::Instant;
 use crate::link::fault::Fault;
 
 /// Timeouts in a row that open the breaker of a unit. One timeout says little: replies get lost.
-const OPEN_AFTER_TIMEOUTS: u32 = 3;
+pub(in crate::link) const OPEN_AFTER_TIMEOUTS: u32 = 3;
 
 /// The longest time for which a breaker stays open. Clients wait for requests, unlike for polls.
 const MAX_OPEN: Duration = Duration::from_secs(5);

@@ -1,22 +1,26 @@
 //! Carries out the requests of listeners and event loops, on the thread of the link. For listeners, every
 //! failure becomes the exception of a gateway (V1.1b3, 7); event loops get the error itself.
 
-use std::cell::RefCell;
+use std::cell::Cell;
 use std::rc::Rc;
 use std::sync::{Arc, Weak};
+use std::time::Duration;
 
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
 use tokio::sync::mpsc;
 use tokio::task::spawn_local;
+use tokio::time::Instant;
 
-use crate::client::ClientError;
 use crate::link::access::Link;
 use crate::link::fault::{Exchanged, Fault, exception, exception_code, fault};
-use crate::link::limits::circuit_breaker::{CircuitBreakers, Down};
+use crate::link::limits::circuit_breaker::{CircuitBreakers, Down, OPEN_AFTER_TIMEOUTS};
 use crate::link::limits::permit::Permit;
-use crate::link::route::{Call, LinkCounters, LinkSettings, Reply, SharedLink};
+use crate::link::route::{Call, LinkSettings, Reply, SharedLink};
 use crate::link::scheduling::shared_reads::{SharedReads, shareable};
 use crate::link::scheduling::write_barrier::Order;
+
+/// A link without an answer for so long is silent. One unit that is silent beside others does not make it so.
+const SILENT_AFTER: Duration = Duration::from_secs(10);
 
 /// Carries out the requests to a link until all that could send some are dropped.
 pub(crate) async fn serve(
@@ -31,7 +35,8 @@ pub(crate) async fn serve(
     let reads = SharedReads::new(settings.coalesce, settings.cache);
     let breakers = CircuitBreakers::new(link.retry);
     let order = Arc::<Order>::default();
-    let serving = Rc::new(Serving { link, order, reads, breakers, error: RefCell::default() });
+    let (failures, answered) = Default::default();
+    let serving = Rc::new(Serving { link, order, reads, breakers, failures, answered });
     while let Some(call) = calls.recv().await {
         let Some(shared) = shared.upgrade() else { return };
         spawn_local(Rc::clone(&serving).carry_out(call, shared));
@@ -43,8 +48,10 @@ struct Serving {
     order: Arc<Order>,
     reads: SharedReads,
     breakers: CircuitBreakers,
-    /// Why the address could not be reached the last time.
-    error: RefCell<Option<Arc<ClientError>>>,
+    /// Requests in a row that had no answer.
+    failures: Cell<u32>,
+    /// When the last answer came.
+    answered: Cell<Option<Instant>>,
 }
 
 impl Serving {
@@ -63,7 +70,7 @@ impl Serving {
             counters.cached.add();
             return reply.send(Ok(&pdu));
         }
-        let Some(reply) = self.admitted(unit_id, &request, vec![reply], counters).pop() else {
+        let Some(reply) = self.admitted(unit_id, &request, vec![reply], &shared).pop() else {
             return;
         };
         let joining = self.reads.join(read.clone(), reply);
@@ -80,7 +87,7 @@ impl Serving {
             return counters.withdrawn.add();
         }
         // Requests before this one may have opened a breaker while it waited.
-        let mut replies = self.admitted(unit_id, &request, replies, counters);
+        let mut replies = self.admitted(unit_id, &request, replies, &shared);
         let Some(timeout) = replies.iter().map(Reply::timeout).max() else { return };
         // Who has given up until now was told that nothing is sent.
         replies.retain(Reply::is_next);
@@ -92,7 +99,7 @@ impl Serving {
             self.link.exchange(unit_id, &request, timeout, true, &Permit::default()).await;
         drop(turn);
         let from_listener = replies.iter().any(Reply::is_of_listener);
-        self.record((unit_id, request.pdu()[0]), &answered, from_listener);
+        self.record((unit_id, request.pdu()[0]), &answered, from_listener, &shared);
         let error = match answered {
             Ok(pdu) => {
                 counters.replies.add();
@@ -123,17 +130,16 @@ impl Serving {
         unit_id: u8,
         request: &EncodedRequest,
         replies: Vec<Reply>,
-        counters: &LinkCounters,
+        shared: &SharedLink,
     ) -> Vec<Reply> {
         let Err(down) = self.breakers.check(unit_id, request.pdu()[0]) else { return replies };
         // Not 0B, after which a write may have been carried out: nothing was sent.
         let pdu = exception(request.pdu(), ExceptionCode::GatewayPathUnavailable.code());
-        let error = self.error.borrow();
-        let error = error.as_ref().filter(|_| down == Down::Address);
+        let error = shared.error().filter(|_| down == Down::Address);
         let mut admitted = Vec::new();
         let mut is_refused = false;
         for reply in replies {
-            match error {
+            match &error {
                 Some(error) => reply.send(Err((error, &pdu))),
                 None if reply.is_of_listener() => reply.send(Ok(&pdu)),
                 None => {
@@ -144,23 +150,34 @@ impl Serving {
             is_refused = true;
         }
         if is_refused {
-            counters.refused_down.add();
+            shared.counters.refused_down.add();
         }
         admitted
     }
 
-    /// Notes the outcome for the breakers. The timeouts of event loops alone say nothing about a unit: they
-    /// may be short.
-    fn record(&self, of: (u8, u8), answered: &Exchanged, from_listener: bool) {
+    /// Notes the outcome for the breakers, and the error of the link. The timeouts of event loops alone say
+    /// nothing about a unit: they may be short.
+    fn record(&self, of: (u8, u8), answered: &Exchanged, from_listener: bool, shared: &SharedLink) {
         let is_unreachable = self.link.retry_at().is_some();
-        if let Err(error) = answered
-            && is_unreachable
-        {
-            self.error.replace(Some(Arc::clone(error)));
-        }
         let outcome = answered.as_ref().map(drop).map_err(|error| fault(error));
-        if outcome != Err(Fault::Timeout) || from_listener || is_unreachable {
-            self.breakers.record(of, outcome, is_unreachable);
+        if outcome == Err(Fault::Timeout) && !from_listener && !is_unreachable {
+            return;
+        }
+        self.breakers.record(of, outcome, is_unreachable);
+        match answered {
+            Err(error) if !matches!(outcome, Err(Fault::Exception(_))) => {
+                self.failures.set(self.failures.get().saturating_add(1));
+                let is_silent = self.answered.get().is_none_or(|at| at.elapsed() >= SILENT_AFTER)
+                    && self.failures.get() >= OPEN_AFTER_TIMEOUTS;
+                if is_unreachable || is_silent {
+                    shared.set_error(Some(error));
+                }
+            }
+            _ => {
+                self.failures.set(0);
+                self.answered.set(Some(Instant::now()));
+                shared.set_error(None);
+            }
         }
     }
 }
