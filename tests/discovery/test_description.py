@@ -130,6 +130,26 @@ def test_a_sunspec_value_follows_its_scale_factor(serve: Serve, tmp_path: Path) 
         assert "10^-32768, allowed: exponents from -10 to 10" in str(reading.error)
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_a_sunspec_text_is_read_as_it_is_described(
+    serve: Serve, tmp_path: Path, encoding: str
+) -> None:
+    registers = sunspec_device.registers(sunspec_device.common())
+    registers[4:20] = values.encode("Müller", "string:32", encoding=encoding)
+    registers[44:52] = [0x8000] * 8
+    memory = holdfast.Memory(holding_registers=(40000, len(registers)))
+    memory.write("holding_registers", 40000, registers)
+    server = serve({1: memory})
+    found = {each.tag.name: each for each in described(server, areas=["holding_registers"]).tags}
+    assert "common_Vr" not in found
+    file = tmp_path / "device.yaml"
+    file.write_text(tags_as_yaml(each.tag for each in found.values()), encoding="utf-8")
+    reader = TagReader([load_tags(file)["common_Mn"]])
+    with holdfast.SyncClient(cli.url(server)) as client:
+        [reading] = reader.read(client)
+    assert (found["common_Mn"].values, reading.value) == (("Müller",), "Müller")
+
+
 def test_a_scale_factor_that_is_too_far_leaves_the_raw_number() -> None:
     far = sunspec.Point(
         name="far",

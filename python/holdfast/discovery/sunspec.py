@@ -65,6 +65,9 @@ TYPES = {
 }
 """The type of each SunSpec type, and the value of a point that is not implemented."""
 
+NO_TEXT = 0x8000
+"""Some devices fill the registers of a text that is not implemented with this, instead of 0."""
+
 HIDDEN = ("sunssf", "pad")
 """Types of points that are not values of their own."""
 
@@ -96,6 +99,8 @@ class Point:
     """The number of a point without a value; `None` for types without one."""
     value: Any
     """The decoded number, text, or `None` if the point is not implemented."""
+    encoding: str | None = None
+    """The encoding of a text."""
 
 
 @dataclass(frozen=True)
@@ -270,6 +275,7 @@ class _Group:
         name, kind, factor, unit, label, access, symbols = full
         type, missing = TYPES.get(kind, (kind, None))
         registers = self.registers[offset : offset + _size(kind)]
+        encoding = _encoding(registers) if type.startswith("string") else None
         scale = self._scale(factor)
         scaled = self._number(factor) if isinstance(factor, str) and factor else None
         return Point(
@@ -284,7 +290,8 @@ class _Group:
             can_be_written=access == "w",
             states={int(value): text for value, text in (symbols or {}).items()},
             missing=missing,
-            value=None if scale is None else _value(registers, type, missing),
+            value=None if scale is None else _value(registers, type, missing, encoding),
+            encoding=encoding,
         )
 
     def _scale(self, factor: int | str) -> float | None:
@@ -303,10 +310,23 @@ def _size(kind: str) -> int:
     return 1 if kind in HIDDEN else register_count(TYPES.get(kind, (kind, None))[0])
 
 
-def _value(registers: Sequence[int], type: str, missing: int | None) -> Any:
-    if type.startswith("string"):
-        data = b"".join(each.to_bytes(2, "big") for each in registers)
-        text = data.rstrip(b"\0 ").decode("utf-8", "replace")
-        return text or None
+def _encoding(registers: Sequence[int]) -> str:
+    """UTF-8, as SunSpec has it, or Latin-1 of a device that does not follow it."""
+    try:
+        _bytes(registers).decode("utf-8")
+    except UnicodeDecodeError:
+        return "latin-1"
+    return "utf-8"
+
+
+def _value(registers: Sequence[int], type: str, missing: int | None, encoding: str | None) -> Any:
+    if encoding is not None:
+        if set(registers) == {NO_TEXT}:
+            return None
+        return _bytes(registers).rstrip(b"\0 ").decode(encoding) or None
     value = decode(list(registers), type)
     return None if value == missing or value != value else value
+
+
+def _bytes(registers: Sequence[int]) -> bytes:
+    return b"".join(each.to_bytes(2, "big") for each in registers)

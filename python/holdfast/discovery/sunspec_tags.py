@@ -43,6 +43,7 @@ def _of_point(model: Model, point: Point, names: set[str]) -> DescribedTag:
         "holding_registers",
         point.address,
         point.type,
+        encoding=point.encoding,
         scale=1 if flaw else point.scale,
         unit="" if flaw else point.unit,
         states=point.states,
