@@ -85,6 +85,13 @@ def test_each_kind_of_tag_is_a_valid_entity(of: Tag, component: str) -> None:
     assert found(of).component == component
 
 
+@pytest.mark.parametrize("writes", [False, True])
+def test_an_inverted_coil_is_on_where_its_states_say_on(writes: bool) -> None:
+    of = tag(area="coils", type="bool", states={0: "on", 1: "off"}, writable=True)
+    config = found(of, writes=writes).config
+    assert (config["payload_on"], config["payload_off"]) == ("on", "off")
+
+
 @pytest.mark.parametrize(
     "unit", sorted({unit for units in UNITS.values() for unit in units} | {"%", ""})
 )

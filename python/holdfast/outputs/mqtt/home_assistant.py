@@ -199,6 +199,8 @@ class Discovery:
         command = {"command_topic": self._names.of_commands(device, tag.name)} if writes else {}
         if tag.of_type.base in ("bool", "bit"):
             on, off = text_of(tag, True), text_of(tag, False)
+            if off == "on":  # A relay that is on at 0: Home Assistant has no names, only on.
+                on, off = off, on
             if not writes:
                 return "binary_sensor", {"payload_on": on, "payload_off": off}
             states = {"state_on": on, "state_off": off}
