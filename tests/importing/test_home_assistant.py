@@ -220,6 +220,44 @@ def test_switches_write_the_numbers_that_the_source_wrote(
     ]
 
 
+def test_an_inverted_coil_is_on_at_0(imported: Callable[..., Imported]) -> None:
+    inverted = "write_type: coil, command_on: 0, command_off: 255"
+    found = imported(
+        f"switches: [{{name: plain, address: 1, {inverted}}}, "
+        f"{{name: verified, address: 2, {inverted}, verify: {{input_type: discrete_input, "
+        "address: 9, state_on: 0, state_off: 1}}]"
+    )
+    found_tags = tags(found)
+    states = {0: "on", 1: "off"}
+    assert found_tags["plain"] == {
+        "area": "coils",
+        "address": 1,
+        "states": states,
+        "writable": True,
+    }
+    assert found_tags["verified"]["states"] == states
+    assert found_tags["verified_state"] == {
+        "area": "discrete_inputs",
+        "address": 9,
+        "description": "verified state",
+    }
+    assert not [note for note in notes(found) if "instead of a switch" in note]
+
+
+@pytest.mark.parametrize("commands", ["command_on: 0", "command_on: 2, command_off: 3"])
+def test_a_coil_that_is_always_written_alike_is_left_out(
+    imported: Callable[..., Imported], commands: str
+) -> None:
+    found = imported(
+        f"switches: [{{name: same, address: 1, write_type: coil, {commands}}}, "
+        "{name: other, address: 2}]"
+    )
+    assert list(tags(found)) == ["other"]
+    value = 0 if commands == "command_on: 0" else 1
+    message = f"same writes {value} for on and for off: add a tag"
+    assert f"8: modbus[0].switches[0]: left out: {message}" in notes(found)
+
+
 @pytest.mark.parametrize(
     "entities",
     [
@@ -284,6 +322,26 @@ def test_covers_and_climates_become_their_registers(imported: Callable[..., Impo
     assert found_tags["hall_mode"]["states"] == {0: "off", 2: "fan_only", 3: "fan_only (3)"}
     assert found_tags["hall_fan_mode"]["states"] == {1: "low", 2: "high"}
     assert found_tags["hall_power"]["area"] == "coils"
+
+
+def test_a_number_with_several_names_has_the_first_of_the_source(
+    imported: Callable[..., Imported],
+) -> None:
+    found = imported(
+        "covers: [{name: Gate, address: 20, state_open: 1, state_opening: 1}]\n"
+        "    climates: [{name: Hall, address: 30, target_temp_register: 31, "
+        "hvac_mode_register: {address: 32, values: {state_auto: 1, state_heat: 1, state_off: 0}}, "
+        "hvac_action_register: {address: 33, values: {action_off: 0, action_idle: 0}}}]"
+    )
+    found_tags = tags(found)
+    assert found_tags["gate"]["states"] == {0: "closed", 1: "open", 3: "closing"}
+    assert found_tags["hall_mode"]["states"] == {0: "off", 1: "heat"}
+    assert found_tags["hall_action"]["states"] == {0: "idle"}
+    assert [note.partition(": left out: ")[2] for note in notes(found) if "left out" in note] == [
+        "opening is 1, as open",
+        "auto is 1, as heat",
+        "off is 0, as idle",
+    ]
 
 
 def test_each_unit_id_of_a_hub_is_a_device_with_its_own_interval(

@@ -49,6 +49,10 @@ _CODES = dict(zip("hHiIqQefd", _TYPES, strict=True)) | {"l": "int32", "L": "uint
 _PREFIX = re.compile(r"^(swing_mode_)?(state_|action_)(fan_(?!only))?")
 """What the name of a mode begins with."""
 
+_ACTIONS = ("cooling", "defrosting", "drying", "fan", "heating", "idle")
+_SEARCHED = (*_ACTIONS, "off", "heat", "cool", "heat_cool", "auto", "dry", "fan_only", "preheating")
+"""The order in which the source looked for the action or the mode of a number."""
+
 _MODES = ("hvac_mode_register", "fan_mode_register", "swing_mode_register")
 
 
@@ -258,15 +262,18 @@ def _switch(places: Places, entity: Section) -> None:
     """A coil, or a register with a number for on and one for off; and where its state is read."""
     kinds = ("holding", "holdings", "coil", "coils")
     area = _area(entity, "write_type", "holding", kinds)
-    places.written[entity.get("write_type") in ("holdings", "coils")].append(entity.path)
     address = _address(entity)
     on, off = _register(entity, "command_on", 1), _register(entity, "command_off", 0)
+    if area in _BITS:  # The source wrote every number but 0 as 1.
+        on, off = min(on, 1), min(off, 1)
     verify = entity.mapping("verify")
     if address is None:
         return
-    if area in _BITS and (on, off) != (1, 0) and not (on and not off):
-        message = f"found {on} for on and {off} for off of a coil, allowed: 1 and 0"
-        entity.desk.problem(entity.at("command_on"), message)
+    if on == off:
+        message = f"{_name(entity)} writes {on} for on and for off: add a tag"
+        entity.desk.left_out(entity.path, message)
+        return
+    places.written[entity.get("write_type") in ("holdings", "coils")].append(entity.path)
     settings = _two_states(entity, area, [on], [off])
     places.add(_name(entity), area, address, **settings, writable=True)
     if verify is None:
@@ -289,6 +296,8 @@ def _verify(places: Places, entity: Section, verify: Section, written: _Written)
     its_address = _address(verify, required=False)
     its_address = address if its_address is None else its_address
     its_on, its_off = _numbers(verify, "state_on") or on, _numbers(verify, "state_off") or off
+    if its_area in _BITS:
+        its_on, its_off = [1], [0]  # The source read 1 as on, whatever it wrote.
     verify.integer("delay", 0, 86_400)  # A write that is confirmed is read back at once.
     verify.close()
     if (its_area, its_address, its_on, its_off) == (area, address, on, off):
@@ -313,20 +322,22 @@ def _two_states(
     entity: Section, area: Area, on: list[int], off: list[int], *, writable: bool = True
 ) -> dict[str, Any]:
     """A bit, a register that is a bit, or one with names for its numbers."""
-    if area in _BITS:
-        return {}
     if (on, off) == ([1], [0]):
-        return {"type": "bool"}
-    if writable:
+        return {} if area in _BITS else {"type": "bool"}
+    if writable and area not in _BITS:
         entity.desk.changed(entity.path, "a select of on and off instead of a switch")
-    return _states([*((number, "off") for number in off), *((number, "on") for number in on)])
+    names = [*((number, "on") for number in on), *((number, "off") for number in off)]
+    return _states(entity.desk, ((number, name, entity.path) for number, name in names))
 
 
-def _states(names: Iterable[tuple[int, str]]) -> dict[str, Any]:
-    """Names for the numbers of a register, each once."""
+def _states(desk: Desk, names: Iterable[tuple[int, str, KeyPath]]) -> dict[str, Any]:
+    """Names for the numbers of a register; a number with several has the first."""
     states: dict[int, str] = {}
-    for number, name in names:
-        states[number] = f"{name} ({number})" if name in states.values() else name
+    for number, name, path in names:
+        if number in states:
+            desk.left_out(path, f"{name} is {number}, as {states[number]}")
+        else:
+            states[number] = f"{name} ({number})" if name in states.values() else name
     return {"states": dict(sorted(states.items()))}
 
 
@@ -334,10 +345,13 @@ def _cover(places: Places, entity: Section) -> None:
     """A coil, or a register with the numbers of open and closed."""
     area = _area(entity, "input_type", "holding", ("holding", "coil"))
     address = _address(entity)
+    # closed and open are first: the source wrote them.
     defaults = {"closed": 0, "open": 1, "opening": 2, "closing": 3}
-    states = _states(
-        (_register(entity, f"state_{name}", usual), name) for name, usual in defaults.items()
-    )
+    numbers = [
+        (_register(entity, f"state_{name}", usual), name, entity.at(f"state_{name}"))
+        for name, usual in defaults.items()
+    ]
+    states = _states(entity.desk, numbers)
     status = _address(entity, "status_register", required=False)
     status_area = _area(entity, "status_register_type", "holding", _REGISTERS)
     if address is None:
@@ -414,10 +428,10 @@ def _mode(places: Places, entity: Section, key: str, *, writable: bool) -> None:
         message = "without address and values, allowed: with both"
         entity.desk.problem(entity.at(key), message)
         return
-    names = ((str(name), _numbers(values, name)) for name in values.data)
-    settings = _states(
-        (number, _PREFIX.sub("", name)) for name, numbers in names for number in numbers
-    )
+    names = [(_PREFIX.sub("", str(key)), key) for key in values.data]
+    names.sort(key=lambda each: _SEARCHED.index(each[0]) if each[0] in _SEARCHED else 99)
+    found = [(each, name, values.at(key)) for name, key in names for each in _numbers(values, key)]
+    settings = _states(entity.desk, found)
     if writable:
         settings["writable"] = True
     title = key.removesuffix("_register").removeprefix("hvac_").replace("_", " ")
