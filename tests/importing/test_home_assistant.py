@@ -584,6 +584,61 @@ def test_an_octal_number_is_refused(imported: Callable[..., Imported]) -> None:
         imported("sensors: [{name: a, address: 0100}]")
 
 
+def test_actions_that_write_are_noted_with_what_replaces_them(
+    imported: Callable[..., Imported],
+) -> None:
+    hub = HUB.replace("automation: !include automations.yaml\n", "")
+    found = imported(
+        "sensors: [{name: Setpoint, slave: 1, address: 0, scale: 0.1}]\n"
+        "    binary_sensors: [{name: Door, slave: 1, address: 9, input_type: holding}]\n"
+        "    switches: [{name: Pump, slave: 2, address: 5, write_type: coil}]\n"
+        "automation:\n"
+        "  - action:\n"
+        "      - service: modbus.write_register\n"
+        "        data: {hub: inverter, unit: 1, address: 0, value: 180}\n"
+        "      - service_template: \"{{ 'modbus.write_coil' if x else 'light.toggle' }}\"\n"
+        "        data_template: {hub: inverter, slave: 2, address: '5', state: true}\n"
+        "script:\n"
+        "  charge:\n"
+        "    sequence:\n"
+        "      - choose: [{sequence: [{action: modbus.write_register, data: "
+        "{hub: inverter, slave: 1, address: 0, value: 1}}]}]\n"
+        "      - {action: modbus.write_register, data: {address: '{{ a }}', value: 1}}\n"
+        "      - {action: modbus.write_register, data: {hub: inverter, address: 9, value: 1}}\n"
+        "      - {action: modbus.write_register, data: '{{ d }}'}\n"
+        "      - {action: modbus.stop, data: {hub: inverter}}\n",
+        hub,
+    )
+    stops = "stops when modbus is removed"
+    unknown = f"{stops}: make a tag writable, and publish to its set topic"
+    register = "check: modbus.write_register to address"
+    assert [note for note in notes(found) if stops in note] == [
+        f"12: automation[0].action[0].service: {register} 0 of unit 1 of hub 'inverter' {stops}: "
+        "set writable: true for setpoint of inverter-1, and publish the scaled value to "
+        "plant/inverter-1/setpoint/set (lines 12 and 19)",
+        "14: automation[0].action[1].service_template: check: modbus.write_coil to address '5' of "
+        f"unit 2 of hub 'inverter' {stops}: publish the value to plant/inverter-2/pump/set",
+        f"20: script.charge.sequence[1].action: {register} '{{{{ a }}}}' of unit 1 of hub "
+        f"'modbus_hub' {unknown}",
+        f"21: script.charge.sequence[2].action: {register} 9 of unit 1 of hub 'inverter' {unknown}",
+        f"22: script.charge.sequence[3].action: {register} nothing of unit 1 of hub 'modbus_hub' "
+        f"{unknown}",
+    ]
+
+
+def test_actions_in_other_files_and_entities_without_a_unit_are_to_be_checked(
+    imported: Callable[..., Imported],
+) -> None:
+    found = imported(
+        "sensors: [{name: a, address: 1}, {name: b, address: 2}, {name: c, slave: 1, address: 3}]"
+    )
+    assert [note.partition(": check: ")[2] for note in notes(found)][3:] == [
+        "modbus.write_register or modbus.write_coil in automations and scripts stops, also in "
+        "other files: publish to set topics instead, with writes: true in the output",
+        "no slave: unit 1, as in newer versions; older ones asked 0 (and 1 more)",
+    ]
+
+
 def test_the_command_says_what_comes_next(tmp_path: Path) -> None:
     file = tmp_path / "modbus.yaml"
     file.write_text(HUB.replace("{entities}", "sensors: [{name: a, address: 1}]"))
