@@ -362,6 +362,7 @@ impl Device {
         if self.settings.must_stand_by() {
             self.link.release();
             self.state.set_standby(true);
+            self.forwards.iter().for_each(|forward| forward.withdraw());
             self.publish_status();
             loop {
                 tokio::select! {
@@ -710,21 +711,21 @@ impl Device {
         submit_under(self.settings.fence.as_ref(), memory, access, write, done)
     }
 
-    /// Whether another node writes what the device holds.
+    /// Whether another node writes and forwards what the device holds.
     fn is_without_lease(&self) -> bool {
         let fence = self.settings.fence.as_ref();
         self.state.stands_by() || fence.is_some_and(|fence| !fence.allows())
     }
 
     fn publish_status(&self) {
-        let status = self.state.status();
+        let (status, without_lease) = (self.state.status(), self.is_without_lease());
         if let Some(to) = &self.settings.status
-            && !(self.is_without_lease() && to.memory.is_replicated())
+            && !(without_lease && to.memory.is_replicated())
             && status.write_by(to, |write| self.store(&to.memory, Access::Ingest, write)).is_err()
         {
             self.state.count_unstored();
         }
-        if self.state.stands_by() {
+        if without_lease {
             return;
         }
         for forward in &self.forwards {

@@ -18,11 +18,11 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, timeout_at};
 
 use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
-use crate::link::{agree, dial};
+use crate::link::{Fence, agree, dial};
 use crate::name_lookup;
 use crate::raw_ingest_areas::in_packet;
-use crate::tls::TlsFailure;
 use crate::tls::client::ClientTls;
+use crate::tls::{Channel, TlsFailure};
 
 /// The longest pause before a receiver that is down is tried again.
 const MAX_PAUSE: Duration = Duration::from_secs(10);
@@ -105,8 +105,11 @@ impl ForwardCounters {
 pub(super) struct Forward {
     settings: ForwardSettings,
     pub(super) counters: Arc<ForwardCounters>,
+    /// That of the device.
+    fence: Option<Arc<Fence>>,
     waiting: RefCell<Waiting>,
     queued: Notify,
+    withdrawn: Notify,
     failures: Cell<u32>,
     /// The status block that was offered last.
     last_status: RefCell<Vec<u8>>,
@@ -148,12 +151,18 @@ impl Waiting {
 }
 
 impl Forward {
-    pub(super) fn new(settings: ForwardSettings, counters: Arc<ForwardCounters>) -> Rc<Forward> {
+    pub(super) fn new(
+        settings: ForwardSettings,
+        counters: Arc<ForwardCounters>,
+        fence: Option<Arc<Fence>>,
+    ) -> Rc<Forward> {
         Rc::new(Forward {
             settings,
             counters,
+            fence,
             waiting: RefCell::default(),
             queued: Notify::new(),
+            withdrawn: Notify::new(),
             failures: Cell::new(0),
             last_status: RefCell::default(),
         })
@@ -207,6 +216,24 @@ impl Forward {
         self.queued.notify_one();
     }
 
+    /// Drops the packets that are queued or not confirmed yet: another node has the lease of the device, and
+    /// forwards newer bytes. If the lease comes back, the status block is sent again.
+    pub(super) fn withdraw(&self) {
+        self.waiting.take();
+        self.last_status.take();
+        self.withdrawn.notify_waiters();
+    }
+
+    /// Whether the receiver may get packets of this node now.
+    fn may_send(&self) -> bool {
+        self.fence.as_ref().is_none_or(|fence| fence.allows())
+    }
+
+    /// Whether its device has this fence.
+    pub(super) fn is_behind(&self, fence: Option<&Arc<Fence>>) -> bool {
+        self.fence.as_ref().map(Arc::as_ptr) == fence.map(Arc::as_ptr)
+    }
+
     /// Sends the queued packets, one after another, forever.
     pub(super) async fn run(self: Rc<Forward>) {
         loop {
@@ -216,7 +243,11 @@ impl Forward {
                 continue;
             };
             let deadline = Instant::now() + self.settings.timeout;
-            let sent = timeout_at(deadline, self.send(&packet, deadline)).await;
+            let sent = tokio::select! {
+                biased;
+                () = self.withdrawn.notified() => continue,
+                sent = timeout_at(deadline, self.send(&packet, deadline)) => sent,
+            };
             let too_late = || {
                 let seconds = self.settings.timeout.as_secs_f64();
                 io::Error::new(ErrorKind::TimedOut, format!("no reply within {seconds} s"))
@@ -227,6 +258,8 @@ impl Forward {
                     let counters = &self.counters;
                     if reply == DONE { counters.sent.add() } else { counters.refused.add() }
                 }
+                // The device may not have noticed yet that its lease has ended.
+                Err(_) if !self.may_send() => self.withdraw(),
                 Err(error) => {
                     self.counters.fail(&error);
                     if self.waiting.borrow_mut().put_back(of, packet) {
@@ -243,16 +276,27 @@ impl Forward {
         let found = name_lookup::addresses_of(&self.settings.host, self.settings.port).await?;
         let mut stream = dial(found, deadline).await?;
         if let Some(tls) = &self.settings.tls {
-            return send_over_tls(stream, tls, packet).await;
+            let channel = agree(&mut stream, tls).await?;
+            self.check_lease()?;
+            return send_over_tls(stream, channel, packet).await;
         }
+        self.check_lease()?;
         stream.write_all(packet).await?;
         stream.read_u8().await
+    }
+
+    /// Called right before a packet is sent: the process may have been stopped since it was queued.
+    fn check_lease(&self) -> io::Result<()> {
+        if self.may_send() { Ok(()) } else { Err(io::Error::other("without the lease")) }
     }
 }
 
 /// Sends a packet over TLS. Returns the reply.
-async fn send_over_tls(mut stream: TcpStream, tls: &ClientTls, packet: &[u8]) -> io::Result<u8> {
-    let mut channel = agree(&mut stream, tls).await?;
+async fn send_over_tls(
+    mut stream: TcpStream,
+    mut channel: Channel,
+    packet: &[u8],
+) -> io::Result<u8> {
     let (mut plain, mut out, mut chunk) = (Vec::new(), Vec::new(), [0; CHUNK_BYTES]);
     channel.send(packet, &mut out);
     // A receiver that refuses the certificate closes the connection. Its alert says why.
@@ -283,8 +327,122 @@ fn lost(failure: TlsFailure) -> io::Error {
 }
 
 #[cfg(test)]
+impl Forward {
+    /// Whether a packet waits to be sent.
+    pub(super) fn has_waiting(&self) -> bool {
+        !self.waiting.borrow().order.is_empty()
+    }
+}
+
+#[cfg(test)]
+impl ForwardSettings {
+    /// A receiver at this port of this computer.
+    pub(super) fn for_tests(port: u16, status: Option<(u16, BlockSettings)>) -> ForwardSettings {
+        ForwardSettings {
+            host: "127.0.0.1".into(),
+            port,
+            tls: None,
+            format: Format::V1,
+            target: 1,
+            timeout: Duration::from_secs(60),
+            offsets: Vec::new(),
+            status,
+        }
+    }
+}
+
+#[cfg(test)]
 mod tests {
+    use holdfast_memory::Term;
+    use tokio::net::TcpListener;
+    use tokio::runtime::Builder;
+    use tokio::task::{LocalSet, spawn_local};
+
     use super::*;
+
+    const AREA: Area = Area::HoldingRegisters;
+
+    /// Runs a test with a receiver, and with what forwards to it behind a fence.
+    fn with_receiver<F: Future<Output = ()>>(
+        test: impl FnOnce(TcpListener, Rc<Forward>, Arc<Fence>) -> F,
+    ) {
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let receiver = TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let block =
+                BlockSettings { area: AREA, slot: 0, name: "meter".into(), keep_last_error: false };
+            let port = receiver.local_addr().unwrap().port();
+            let settings = ForwardSettings::for_tests(port, Some((2, block)));
+            let fence = Arc::new(Fence::new(1));
+            let forward = Forward::new(settings, Arc::default(), Some(Arc::clone(&fence)));
+            spawn_local(Rc::clone(&forward).run());
+            let test = test(receiver, forward, fence);
+            tokio::time::timeout(Duration::from_secs(60), test).await.unwrap();
+        });
+    }
+
+    fn open(fence: &Fence) {
+        let until = std::time::Instant::now() + Duration::from_secs(3600);
+        fence.open(until, Term::default(), Duration::ZERO);
+    }
+
+    fn offer(forward: &Forward, value: u8) {
+        forward.offer(0, AREA, 0, NonZeroU16::MIN, &[0, value]);
+    }
+
+    /// Reads a packet with one register. Returns the low byte of its value.
+    async fn value(stream: &mut TcpStream) -> u8 {
+        let header = Header {
+            area: in_packet(AREA).unwrap(),
+            target: 1,
+            address: 0,
+            count: NonZeroU16::MIN,
+        };
+        let mut packet = vec![0; Format::V1.packet_len(&header)];
+        stream.read_exact(&mut packet).await.unwrap();
+        packet.pop().unwrap()
+    }
+
+    #[test]
+    fn nothing_is_sent_without_the_lease() {
+        with_receiver(async |receiver, forward, fence| {
+            offer(&forward, 1);
+            let (mut stream, _) = receiver.accept().await.unwrap();
+            assert_eq!(stream.read(&mut [0]).await.unwrap(), 0, "it is connected, then closed");
+            open(&fence);
+            offer(&forward, 2);
+            let (mut stream, _) = receiver.accept().await.unwrap();
+            assert_eq!(value(&mut stream).await, 2);
+        });
+    }
+
+    #[test]
+    fn what_is_withdrawn_is_not_sent_again() {
+        with_receiver(async |receiver, forward, fence| {
+            open(&fence);
+            offer(&forward, 1);
+            let (mut unconfirmed, _) = receiver.accept().await.unwrap();
+            assert_eq!(value(&mut unconfirmed).await, 1);
+            offer(&forward, 2);
+            forward.withdraw();
+            offer(&forward, 3);
+            let (mut stream, _) = receiver.accept().await.unwrap();
+            assert_eq!(value(&mut stream).await, 3);
+        });
+    }
+
+    #[test]
+    fn a_status_block_that_was_withdrawn_is_sent_again() {
+        with_receiver(async |_, forward, _| {
+            let status = crate::poller::state::DeviceState::default().status();
+            forward.offer_status(&status);
+            assert!(forward.has_waiting());
+            forward.withdraw();
+            assert!(!forward.has_waiting());
+            forward.offer_status(&status);
+            assert!(forward.has_waiting());
+        });
+    }
 
     #[test]
     fn reads_take_turns_and_newer_bytes_replace_older_ones() {

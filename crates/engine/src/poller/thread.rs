@@ -405,16 +405,19 @@ impl RunningForward {
     fn start(
         settings: ForwardSettings,
         counters: Arc<ForwardCounters>,
+        fence: Option<Arc<Fence>>,
         state: &Arc<DeviceState>,
     ) -> RunningForward {
-        let forward = Forward::new(settings, counters);
+        let forward = Forward::new(settings, counters, fence);
         let task = spawn_guarded(Rc::clone(&forward).run(), Arc::clone(state));
         RunningForward { forward, task }
     }
 
-    /// Whether it has these counters, and has not panicked.
-    fn goes_on(&self, counters: &Arc<ForwardCounters>) -> bool {
-        Arc::ptr_eq(&self.forward.counters, counters) && !self.task.is_finished()
+    /// Whether it has these counters and this fence, and has not panicked.
+    fn goes_on(&self, counters: &Arc<ForwardCounters>, fence: Option<&Arc<Fence>>) -> bool {
+        Arc::ptr_eq(&self.forward.counters, counters)
+            && self.forward.is_behind(fence)
+            && !self.task.is_finished()
     }
 }
 
@@ -610,7 +613,7 @@ fn has_ended(fence: Option<&Arc<Fence>>) -> bool {
 }
 
 /// Creates a device, and starts the tasks that forward its reads. Those of the device before that have
-/// the same receiver go on: they send what is waiting, and what the current poll reads.
+/// the same receiver and fence go on: they send what is waiting, and what the current poll reads.
 fn made(
     planned: Planned,
     polled: Polled,
@@ -621,11 +624,14 @@ fn made(
     polled.state.set_strays(to.0.strays());
     let settings = &planned.settings;
     debug_assert_eq!(settings.forward.len(), polled.forwards.len());
+    let fence = settings.fence.as_ref();
     let receivers = settings.forward.iter().cloned().zip(polled.forwards);
     let running: Vec<RunningForward> = receivers
-        .map(|(settings, counters)| match before.iter().position(|old| old.goes_on(&counters)) {
-            Some(at) => before.swap_remove(at),
-            None => RunningForward::start(settings, counters, &polled.state),
+        .map(|(settings, counters)| {
+            match before.iter().position(|old| old.goes_on(&counters, fence)) {
+                Some(at) => before.swap_remove(at),
+                None => RunningForward::start(settings, counters, fence.cloned(), &polled.state),
+            }
         })
         .collect();
     let forwards = running.iter().map(|running| Rc::clone(&running.forward)).collect();
@@ -888,16 +894,7 @@ mod tests {
     }
 
     fn receiver(target: u16) -> ForwardSettings {
-        ForwardSettings {
-            host: "127.0.0.1".into(),
-            port: 1,
-            tls: None,
-            format: Format::V1,
-            target,
-            timeout: Duration::from_secs(1),
-            offsets: Vec::new(),
-            status: None,
-        }
+        ForwardSettings { target, ..ForwardSettings::for_tests(1, None) }
     }
 
     #[test]

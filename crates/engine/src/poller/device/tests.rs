@@ -3,7 +3,7 @@
 
 use std::sync::Weak;
 
-use holdfast_memory::{Access, Done, Journal, Layout, Memory, Read, Span, Step};
+use holdfast_memory::{Access, Done, Journal, Layout, Memory, Read, Span, Step, Term};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Builder;
@@ -403,6 +403,32 @@ fn a_device_that_stands_by_shows_it_unless_another_node_writes_the_block() {
             let expected = if is_replicated { Health::Ok } else { Health::Standby };
             assert_eq!(shown(), expected.code());
         }
+    });
+}
+
+#[test]
+fn a_device_forwards_nothing_while_another_node_has_its_lease() {
+    with_device(async |endpoint| {
+        let fence = Arc::new(Fence::new(1));
+        let settings = settings(endpoint, &memory(), 0);
+        let (mut device, ..) =
+            device(DeviceSettings { fence: Some(Arc::clone(&fence)), ..settings });
+        let receiver = ForwardSettings::for_tests(1, Some((1, block(AREA, 0))));
+        let forward = Forward::new(receiver, Arc::default(), Some(Arc::clone(&fence)));
+        device.forwards = vec![Rc::clone(&forward)];
+        device.publish_status();
+        assert!(!forward.has_waiting(), "the other node sends the status");
+        fence.open(std::time::Instant::now() + TIMEOUT, Term::default(), Duration::ZERO);
+        device.publish_status();
+        assert!(forward.has_waiting());
+        fence.end();
+        let inbox = Inbox::default();
+        tokio::select! {
+            biased;
+            _ = device.stand_by(&inbox) => panic!("it stands by until the fence opens"),
+            () = tokio::task::yield_now() => {}
+        }
+        assert!(!forward.has_waiting(), "the other node sends what it reads");
     });
 }
 
