@@ -449,6 +449,27 @@ def test_values_that_a_node_replays_are_stale_until_the_device_is_read(
         wire.until(lambda: ask(appliance, both) == "030400070008", "the device was read again")
 
 
+def test_values_of_another_device_that_another_node_reads_into_a_range_are_stale(
+    node: Callable[..., Appliance], settings: Callable[..., Path], device: Device
+) -> None:
+    one = node("a")
+    wire.until(lambda: health(one) == "ok", "the first node polls its device")
+    with Device() as other:
+        other.then = silent
+        never = {"after": 3600, "answer": "exception"}
+        file = settings("b", url=other.url, stale=never)
+        with Appliance(load(file), lease_times=LEASE_TIMES) as two:
+            # From now on, the second node knows how old at most the values of the first one are.
+            assert ask(two, "0600010001") == "0600010001"
+            polls = len(device.peers)
+            wire.until(lambda: len(device.peers) > polls + 5, "the first node goes on")
+            assert ask(one, "0600000001") == "0600000001"
+            wire.until(lambda: ask(two, "0300000001") == "03020001", "the second node has followed")
+            assert [ask(each, "03000a0002") for each in (one, two)] == ["030400070008", "830b"]
+            other.then = other._note
+            wire.until(lambda: ask(two, "03000a0002") == "030400070008", "its device was read")
+
+
 def test_replicas_shows_who_polls_what(settings: Callable[..., Path], device: Device) -> None:
     file = settings("a")
     command = RunCommand(file)

@@ -16,9 +16,9 @@ pub struct MirrorAge {
 #[pymethods]
 impl MirrorAge {
     #[new]
-    #[pyo3(signature = (after, *, refuses))]
-    fn new(after: f64, refuses: bool) -> PyResult<MirrorAge> {
-        let core = Core::new(time_since_boot, seconds("after", after)?, refuses);
+    #[pyo3(signature = (after, *, refuses, lease=None))]
+    fn new(after: f64, refuses: bool, lease: Option<u64>) -> PyResult<MirrorAge> {
+        let core = Core::new(time_since_boot, seconds("after", after)?, refuses, lease);
         Ok(MirrorAge { core: Arc::new(core) })
     }
 

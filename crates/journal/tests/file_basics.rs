@@ -64,7 +64,7 @@ fn contents_survive_a_restart() {
 struct Ages(Mutex<Vec<Duration>>);
 
 impl Freshness for Ages {
-    fn renew(&self, age: Duration) {
+    fn renew(&self, age: Duration, _: Option<u64>) {
         self.0.lock().unwrap().push(age);
     }
 

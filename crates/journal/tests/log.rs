@@ -536,7 +536,7 @@ fn a_restarted_node_goes_on_where_it_was() {
 struct Ages(Mutex<Vec<Duration>>);
 
 impl Freshness for Ages {
-    fn renew(&self, age: Duration) {
+    fn renew(&self, age: Duration, _: Option<u64>) {
         self.0.lock().unwrap().push(age);
     }
 

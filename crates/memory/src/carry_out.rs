@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::error::Refused;
-use crate::memory::{Memory, Ranges, carry_out_across};
+use crate::memory::{Memory, Ranges, Writer, carry_out_across};
 use crate::operation::{Read, Write};
 use crate::step::{Action, CarriedOut, Outcome, Step};
 
@@ -32,13 +32,15 @@ impl Step {
     /// As [`Step::carry_out`].
     pub fn carry_out_late(&self, members: &[Arc<Memory>], age: Option<Duration>) -> Outcome {
         let alone = |refusal| Refused { index: 0, refusal };
+        let lease = self.tenure.map(|tenure| tenure.lease);
+        let writer = Writer { access: self.access, age, lease };
         let read = match &self.action {
             Action::Write(writes) => {
                 let writes: Vec<(&Memory, Write)> = writes
                     .iter()
                     .map(|write| (&*members[usize::from(write.member)], write.borrowed()))
                     .collect();
-                carry_out_across((self.access, age), &writes).map(|()| Vec::new())?
+                carry_out_across(writer, &writes).map(|()| Vec::new())?
             }
             &Action::Mask { member, area, address, and_mask, or_mask } => members
                 [usize::from(member)]
@@ -49,7 +51,7 @@ impl Step {
                 let mut out = vec![0; area.byte_len(count)];
                 let read = Read { area, address, count, out: &mut out };
                 members[usize::from(write.member)]
-                    .change_then_read((self.access, age), write.borrowed(), read, Ranges::All)
+                    .change_then_read(writer, write.borrowed(), read, Ranges::All)
                     .map_err(alone)?;
                 out
             }

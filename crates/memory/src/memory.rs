@@ -70,8 +70,21 @@ const GUARDED: u8 = 2;
 /// A flag of access: mirrored ranges can be stale.
 const AGING: u8 = 4;
 
-/// The age of values that are written when they are known.
-const NOW: Option<Duration> = Some(Duration::ZERO);
+/// With which access a write is carried out, how old its values are, if that is known, and under which lease
+/// they were read from a device.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Writer {
+    pub(crate) access: Access,
+    pub(crate) age: Option<Duration>,
+    pub(crate) lease: Option<u64>,
+}
+
+impl Writer {
+    /// Writes values at once.
+    const fn now(access: Access) -> Writer {
+        Writer { access, age: Some(Duration::ZERO), lease: None }
+    }
+}
 
 static NEXT_RANK: AtomicU64 = AtomicU64::new(0);
 
@@ -186,15 +199,19 @@ impl Memory {
         Ok(())
     }
 
-    /// Notes which mirrored ranges were written as a whole, with values of this age.
+    /// Notes which mirrored ranges were written as a whole, with values of this age and lease.
     #[inline(never)]
-    fn renew<'w>(&self, age: Duration, writes: impl IntoIterator<Item = &'w Write<'w>>) {
+    fn renew<'w>(
+        &self,
+        (age, lease): (Duration, Option<u64>),
+        writes: impl IntoIterator<Item = &'w Write<'w>>,
+    ) {
         let mirrored = self.mirrored();
         for write in writes {
             let touched = mirrored.touched(write.area, write.address, write.count);
             let written = touched.filter(|range| range.is_in(write));
             let freshness = written.filter_map(|range| range.freshness.as_deref());
-            freshness.for_each(|freshness| freshness.renew(age));
+            freshness.for_each(|freshness| freshness.renew(age, lease));
         }
     }
 
@@ -470,7 +487,7 @@ impl Memory {
         let mut content = self.exclusive();
         content.admit(access).map_err(|refusal| Refused { index: 0, refusal })?;
         valid?;
-        self.apply((access, NOW), &mut content, writes);
+        self.apply(Writer::now(access), &mut content, writes);
         Ok(())
     }
 
@@ -537,18 +554,18 @@ impl Memory {
             let fits = out.len() == bytes.len();
             return fits.then(|| out.copy_from_slice(&bytes)).ok_or(Refusal::WrongLength);
         }
-        self.change_then_read((access, NOW), write, read, Ranges::Unreserved)
+        self.change_then_read(Writer::now(access), write, read, Ranges::Unreserved)
     }
 
     /// As [`Memory::write_then_read`], without a journal.
     pub(crate) fn change_then_read(
         &self,
-        (access, age): (Access, Option<Duration>),
+        writer: Writer,
         write: Write<'_>,
         read: Read<'_>,
         ranges: Ranges,
     ) -> Result<(), Refusal> {
-        let writes = [write];
+        let (access, writes) = (writer.access, [write]);
         let valid = self.writable(access, &writes, ranges);
         let offset = self.readable(&read);
         let mut content = self.exclusive();
@@ -558,7 +575,7 @@ impl Memory {
         if ranges == Ranges::Unreserved {
             self.fresh(&content, access, (read.area, read.address, read.count))?;
         }
-        self.apply((access, age), &mut content, &writes);
+        self.apply(writer, &mut content, &writes);
         content.copy_out(offset, read);
         Ok(())
     }
@@ -624,7 +641,7 @@ impl Memory {
     /// stay as old as they were.
     fn apply<'w>(
         &self,
-        (access, age): (Access, Option<Duration>),
+        Writer { access, age, lease }: Writer,
         content: &mut Content,
         writes: impl IntoIterator<Item = &'w Write<'w>> + Clone,
     ) {
@@ -636,7 +653,7 @@ impl Memory {
             && content.access_flags & AGING != 0
             && let Some(age) = age
         {
-            self.renew(age, writes);
+            self.renew((age, lease), writes);
         }
         self.update_seal(access, content);
     }
@@ -740,20 +757,20 @@ pub fn write_across(
     if writes.iter().any(|(memory, _)| memory.has_journal()) {
         return wait(|done| submit_across(access, writes, done)).map(|done| done.sequence);
     }
-    write_checked((access, NOW), writes).map(|()| None)
+    write_checked(Writer::now(access), writes).map(|()| None)
 }
 
 /// As [`write_across`], by a journal.
 pub(crate) fn carry_out_across(
-    (access, age): (Access, Option<Duration>),
+    writer: Writer,
     writes: &[(&Memory, Write<'_>)],
 ) -> Result<(), Refused> {
     for (index, (memory, write)) in writes.iter().enumerate() {
         memory
-            .writable(access, std::slice::from_ref(write), Ranges::All)
+            .writable(writer.access, std::slice::from_ref(write), Ranges::All)
             .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
     }
-    write_checked((access, age), writes)
+    write_checked(writer, writes)
 }
 
 /// Gives writes that were checked to the journal of their memories, as one step.
@@ -778,10 +795,7 @@ fn submit_across(
     Ok(())
 }
 
-fn write_checked(
-    (access, age): (Access, Option<Duration>),
-    writes: &[(&Memory, Write<'_>)],
-) -> Result<(), Refused> {
+fn write_checked(writer: Writer, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
     let mut placed: Vec<Placed> = writes
         .iter()
         .enumerate()
@@ -790,7 +804,7 @@ fn write_checked(
     // The sort is stable: writes to one area of one memory keep their order.
     placed.sort_by_key(|placed| (placed.memory.rank, placed.write.area));
     if !batch::is_large(placed.iter().map(|placed| &placed.write)) {
-        return apply_across((access, age), &placed);
+        return apply_across(writer, &placed);
     }
     let flat: Vec<(&Placed, Vec<Run>)> = placed
         .chunk_by(|a, b| ptr::eq(a.memory, b.memory) && a.write.area == b.write.area)
@@ -802,7 +816,7 @@ fn write_checked(
             runs.iter().map(|run| Placed { write: run.writing(first.write.area), ..**first })
         })
         .collect();
-    apply_across((access, age), &runs)
+    apply_across(writer, &runs)
 }
 
 /// Checks what [`write_across`] checks before it takes the locks: everything but seals and journals.
@@ -834,10 +848,7 @@ struct Target<'p, 'a> {
 }
 
 /// Carries out writes to several memories. The writes are sorted by the rank of their memory.
-fn apply_across(
-    (access, age): (Access, Option<Duration>),
-    placed: &[Placed<'_>],
-) -> Result<(), Refused> {
+fn apply_across(writer: Writer, placed: &[Placed<'_>]) -> Result<(), Refused> {
     debug_assert!(
         placed.is_sorted_by_key(|placed| placed.memory.rank),
         "locks are taken in rank order"
@@ -854,7 +865,7 @@ fn apply_across(
         "each lock is taken once"
     );
     let refused = targets.iter().filter_map(|target| {
-        let refusal = target.content.admit(access).err()?;
+        let refusal = target.content.admit(writer.access).err()?;
         let indexes = target.writes.iter().map(|placed| placed.index);
         Some(Refused { index: indexes.fold(usize::MAX, usize::min), refusal })
     });
@@ -862,7 +873,7 @@ fn apply_across(
         return Err(first);
     }
     for Target { memory, content, writes } in &mut targets {
-        memory.apply((access, age), content, writes.iter().map(|placed| &placed.write));
+        memory.apply(writer, content, writes.iter().map(|placed| &placed.write));
     }
     Ok(())
 }
@@ -934,7 +945,7 @@ mod tests {
     struct Aged(std::sync::atomic::AtomicBool);
 
     impl Freshness for Aged {
-        fn renew(&self, age: Duration) {
+        fn renew(&self, age: Duration, _: Option<u64>) {
             self.0.store(age > Duration::ZERO, Ordering::Relaxed);
         }
 
@@ -1011,7 +1022,7 @@ mod tests {
         let (stale, mirrored) = (Err(Refusal::Stale), Err(Refusal::Mirrored));
         let refused = [stale, stale, stale, mirrored, mirrored, mirrored];
         assert_eq!(accesses(&memory, Access::Client, 5, 3), refused);
-        aged.renew(Duration::ZERO);
+        aged.renew(Duration::ZERO, None);
         let refused = [Ok(()), Ok(()), Ok(()), mirrored, mirrored, mirrored];
         assert_eq!(accesses(&memory, Access::Client, 5, 3), refused);
     }
@@ -1038,12 +1049,12 @@ mod tests {
         let memory = Arc::new(memory);
         let mut follower = Follower::new(Arc::clone(&memory), [(REGISTERS, 7, 2)]).unwrap();
         assert_eq!(follower.changes(), Err(Refusal::Stale));
-        aged.renew(Duration::ZERO);
+        aged.renew(Duration::ZERO, None);
         let all = follower.changes().unwrap();
         assert!(follower.changes().unwrap().1.is_empty());
         aged.0.store(true, Ordering::Relaxed);
         assert_eq!(follower.changes(), Err(Refusal::Stale), "nothing was written since");
-        aged.renew(Duration::ZERO);
+        aged.renew(Duration::ZERO, None);
         assert_eq!(follower.changes(), Ok(all));
     }
 
@@ -1083,7 +1094,7 @@ mod tests {
             });
             assert_eq!(found, [false, true, true]);
             let (memory, aged) = aging(false);
-            aged.renew(Duration::ZERO);
+            aged.renew(Duration::ZERO, None);
             step.carry_out_late(&[Arc::new(memory)], None).unwrap();
             assert!(!aged.is_stale(), "newer values are not older");
         }

@@ -11,8 +11,8 @@ use crate::operation::Write;
 /// to the range: it must not wait.
 pub trait Freshness: fmt::Debug + Send + Sync {
     /// [`Access::Mirror`](crate::Access::Mirror) has written the whole range, with values that are at most
-    /// this old. Those of before were older.
-    fn renew(&self, age: Duration);
+    /// this old, under this lease if the journal knows one. Those of before were older.
+    fn renew(&self, age: Duration, lease: Option<u64>);
 
     /// Whether only the mirror may read or write the range now.
     fn is_stale(&self) -> bool;

@@ -13,7 +13,10 @@ pub type Clock = fn() -> Duration;
 #[derive(Debug)]
 pub struct MirrorAge {
     clock: Clock,
+    /// Since when the range is read from its device.
     began: Duration,
+    /// The number of the lease of the device, if several nodes share the memory.
+    lease: Option<u64>,
     /// The time of the last values, in nanoseconds; 0 if there are none yet.
     renewed: AtomicU64,
     /// In nanoseconds.
@@ -23,10 +26,11 @@ pub struct MirrorAge {
 
 impl MirrorAge {
     /// Values are stale `after` this time. Stale values are refused, or only shown as stale.
-    pub fn new(clock: Clock, after: Duration, refuses: bool) -> MirrorAge {
+    pub fn new(clock: Clock, after: Duration, refuses: bool, lease: Option<u64>) -> MirrorAge {
         MirrorAge {
             clock,
             began: clock(),
+            lease,
             renewed: AtomicU64::new(0),
             after: AtomicU64::new(nanos(after)),
             refuses: AtomicBool::new(refuses),
@@ -56,8 +60,13 @@ impl MirrorAge {
 }
 
 impl Freshness for MirrorAge {
-    fn renew(&self, age: Duration) {
+    fn renew(&self, age: Duration, lease: Option<u64>) {
         let known = (self.clock)().saturating_sub(age);
+        // Before a reload, or on a node that is not reloaded yet, another device may be read into the range.
+        let is_of_another = self.lease.zip(lease).is_some_and(|(own, other)| own != other);
+        if is_of_another || known < self.began {
+            return;
+        }
         // Values that are written later are no older, also if less is known of their age.
         self.renewed.fetch_max(nanos(known).max(1), Ordering::Relaxed);
     }
@@ -85,8 +94,11 @@ mod tests {
         NOW.set(NOW.get() + seconds);
     }
 
+    const LEASE: u64 = 7;
+
     fn of(refuses: bool) -> MirrorAge {
-        MirrorAge::new(|| Duration::from_secs(NOW.get()), Duration::from_secs(10), refuses)
+        let clock = || Duration::from_secs(NOW.get());
+        MirrorAge::new(clock, Duration::from_secs(10), refuses, Some(LEASE))
     }
 
     #[test]
@@ -95,7 +107,7 @@ mod tests {
         pass(3);
         assert_eq!((age.age(), age.stale_for()), (None, Some(Duration::from_secs(3))));
         assert!(age.is_stale());
-        age.renew(Duration::ZERO);
+        age.renew(Duration::ZERO, None);
         assert_eq!((age.age(), age.stale_for()), (Some(Duration::ZERO), None));
         pass(9);
         assert!(!age.is_stale());
@@ -106,20 +118,33 @@ mod tests {
         assert!(!age.is_stale());
         pass(60);
         assert!(age.is_stale());
-        age.renew(Duration::ZERO);
+        age.renew(Duration::ZERO, None);
         assert!(!age.is_stale());
     }
 
     #[test]
     fn values_are_as_old_as_they_were_when_they_came() {
         let age = of(true);
-        age.renew(Duration::from_secs(8));
+        pass(8);
+        age.renew(Duration::from_secs(8), None);
         assert_eq!((age.age(), age.is_stale()), (Some(Duration::from_secs(8)), false));
         pass(2);
         assert!(age.is_stale());
-        age.renew(Duration::from_secs(3));
-        age.renew(Duration::from_secs(9));
+        age.renew(Duration::from_secs(3), None);
+        age.renew(Duration::from_secs(9), None);
         assert_eq!(age.age(), Some(Duration::from_secs(3)), "later values are no older");
+    }
+
+    #[test]
+    fn values_of_another_device_are_not_fresh() {
+        let age = of(true);
+        age.renew(Duration::ZERO, Some(LEASE + 1));
+        assert!(age.is_stale(), "another node reads another device into the range");
+        pass(3);
+        age.renew(Duration::from_secs(4), Some(LEASE));
+        assert!(age.is_stale(), "they were read before the range was of this device");
+        age.renew(Duration::from_secs(3), Some(LEASE));
+        assert!(!age.is_stale());
     }
 
     #[test]

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast import _core
+from holdfast.appliance.parts.device_leases import key_of
 from holdfast.appliance.parts.part import Part
 from holdfast.events import log_lines
 
@@ -45,6 +46,16 @@ class Mirror(NamedTuple):
     age: _core.MirrorAge
 
 
+def _lease_number(config: Config, device: str, place: Place) -> int | None:
+    """The number of the lease under which all nodes write there what they read from the device."""
+    if config.memories[place.memory].replicate is None:
+        return None
+    # Only an appliance with logs loads the client of NATS.
+    from holdfast.replication.leases.leases import lease_number
+
+    return lease_number(key_of(config, device))
+
+
 class Mirrors(Part):
     """The ranges of all devices. `status` is thread-safe."""
 
@@ -75,7 +86,8 @@ class Mirrors(Part):
                 source = (name, device.url, device.unit, read.area, read.address)
                 age = known.get((source, place))
                 if age is None:
-                    age = _core.MirrorAge(after, refuses=refuses)
+                    lease = _lease_number(config, name, place)
+                    age = _core.MirrorAge(after, refuses=refuses, lease=lease)
                 age.set(after, refuses=refuses)
                 mirrors.append(Mirror(name, source, place, age))
         for name, memory in memories.items():
