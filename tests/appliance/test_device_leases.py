@@ -489,7 +489,7 @@ def check_replicas(file: Path) -> None:
     assert line.split() == ["meter", "a"]
     result = invoke("log", "status", str(file), "--json")
     [status] = json.loads(result.stdout)["logs"].values()
-    assert status["devices"] == {"meter": {"node": "a", "polled_here": True}}
+    assert status["devices"] == {"meter": {"node": "a", "polled_here": True, "reason": None}}
 
 
 def test_a_device_of_two_logs_is_refused(settings: Callable[..., Path]) -> None:

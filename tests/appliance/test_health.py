@@ -294,10 +294,13 @@ def test_an_adapter_that_does_not_tell_its_status_holds_up_no_probe() -> None:
 def test_devices_that_another_node_polls_are_no_reason_to_wait() -> None:
     devices = {"a": "ok", "b": "error", "c": "standby", "d": "unknown"}
     nothing: Any = None
-    health = Health(nothing, nothing, {}, lambda: devices, int)
+    unpolled: dict[str, str] = {}
+    health = Health(nothing, nothing, {}, lambda: devices, lambda: unpolled, int)
     assert health._started() == Check(False, "not polled yet: d")
     devices["d"] = "standby"
     assert health._started() == Check(True, "2 polled, 1 without valid replies, 2 on standby")
+    unpolled |= {"d": "no lease", "c": "no lease"}
+    assert health._started() == Check(False, "polled by no node: c, d: no lease")
 
 
 def test_a_part_that_fails_to_close_does_not_keep_the_others_open(run: Run) -> None:

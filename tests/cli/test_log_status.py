@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -50,10 +50,11 @@ def test_a_connected_log_without_contact_is_not_well(monkeypatch: pytest.MonkeyP
     late = "last contact 68.9 s ago, allowed 5 s"
     counters = dict.fromkeys(("sequence", "lag", "steps", "unavailable", "not_confirmed"), 0)
     nodes = [{"name": name, "sequence": 8, "time_ns": 0, "digest": None} for name in ("a", "b")]
-    status = {
+    status: dict[str, Any] = {
         **{"phase": "running", "failure": None, "connected": True, "server": "127.0.0.1:4222"},
         **{"contact_age": 68.9, "obstacle": late, "last_error": reason, "embedded": None},
         **{"node": "a", "nodes": nodes, "digest": [7, "0123456789abcdef", True], **counters},
+        "devices": {},
     }
     monkeypatch.setattr(log_status, "ask", lambda *_: {"logs": {"site": status}})
     result = invoke("log", "status", __file__)
@@ -62,6 +63,15 @@ def test_a_connected_log_without_contact_is_not_well(monkeypatch: pytest.MonkeyP
     assert lines[3:5] == [f"  not caught up: {late}", f"  last error: {reason}"]
     assert [line.split()[0::3] for line in lines[6:]] == [["a", "7"], ["b"]]
     assert lines[6].split()[-1] == "0123456789ab"
+    status |= {"obstacle": None, "devices": {"meter": {"node": "b", "reason": None}}}
+    result = invoke("log", "status", __file__)
+    assert (result.exit_code, result.stdout.splitlines()[-1].split()) == (0, ["meter", "b"])
+    status["devices"]["meter"] = {"node": None, "reason": "no node takes its lease"}
+    result = invoke("log", "status", __file__)
+    assert result.exit_code == 3
+    nobody, reason = result.stdout.splitlines()[-2:]
+    assert nobody.split() == ["meter", "nobody"]
+    assert reason.split(maxsplit=0) == ["no node takes its lease"]
 
 
 def test_a_signal_ends_a_start_that_waits_for_the_log(tmp_path: Path) -> None:

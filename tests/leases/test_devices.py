@@ -48,5 +48,28 @@ def test_what_a_holder_says_of_its_devices_may_be_anything(
     holding = Holding(node="b", process="b", about=about)
     leases.leases.seen["key"] = Entry(1, holding, time.monotonic())
     leases.changed()
-    assert leases.status() == {"meter": {"node": "b" if is_known else None, "polled_here": False}}
+    reason = None if is_known else "b has its address, and not this device"
+    node = "b" if is_known else None
+    assert leases.status() == {"meter": {"node": node, "polled_here": False, "reason": reason}}
     assert bool(logged(caplog, "device_not_polled")) != is_known
+
+
+def test_a_device_whose_lease_nobody_takes_in_time_is_not_polled(leases: _LogLeases) -> None:
+    leases.adopt({"key": ["meter"]})
+    assert leases.unpolled() == {}, "it may be taken soon"
+    long_ago = time.monotonic() - 2 * leases.leases.times.unheld_s
+    leases._wanted_since["key"] = long_ago
+    leases.adopt({"key": ["meter"]})
+    reason = "leases can't be taken: not connected"
+    assert leases.unpolled() == {"meter": reason}
+    assert leases.status()["meter"] == {"node": None, "polled_here": False, "reason": reason}
+    leases.leases.works(None)
+    assert leases.unpolled() == {"meter": "no node takes its lease"}
+    leases.obstacle = lambda _: "it has failed"
+    assert leases.unpolled() == {"meter": "the log is not usable here: it has failed"}
+    leases.leases.seen["key"] = Entry(1, Holding(node="b", process="b"), time.monotonic())
+    assert leases.unpolled() == {}, "another node holds it"
+    leases.leases.seen["key"] = Entry(2, None, time.monotonic())
+    assert leases.unpolled() == {}, "it was given back just now"
+    leases.leases.seen["key"] = Entry(2, None, long_ago)
+    assert list(leases.unpolled()) == ["meter"]

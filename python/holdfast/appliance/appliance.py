@@ -200,6 +200,7 @@ class _Running:
             logs,
             adapters,
             self.devices.health,
+            self.leases.unpolled,
             lambda: len(self.listeners.config.listeners),
         )
         self.diagnostics = Diagnostics(

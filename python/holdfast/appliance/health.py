@@ -27,6 +27,8 @@ class Health:
     _adapters: Mapping[str, Supervisor]
     _devices: Callable[[], Mapping[str, str]]
     """Returns the health of each polled device, as the main thread saw it last."""
+    _unpolled: Callable[[], Mapping[str, str]]
+    """Returns the devices that no node of their log polls, and why."""
     _listeners: Callable[[], int]
     """Returns how many listeners there are."""
     _polled: set[str] = field(default_factory=set)
@@ -47,7 +49,8 @@ class Health:
         """Returns whether clients can be sent to this appliance.
 
         Devices, brokers and receivers that can't be reached do not count: no restart and no other
-        appliance would help, and what is served tells their state.
+        appliance would help, and what is served tells their state. A device that no node polls
+        counts: nothing else tells that its values are old.
         """
         return {
             "running": Check(not self.stopping, "stopping" if self.stopping else "running"),
@@ -79,6 +82,9 @@ class Health:
         self._polled = polled
         if waiting := devices.keys() - polled:
             return Check(False, f"not polled yet: {_named(waiting)}")
+        if unpolled := self._unpolled():
+            reasons = "; ".join(sorted(set(unpolled.values())))
+            return Check(False, f"polled by no node: {_named(unpolled)}: {reasons}")
         if not devices:
             return Check(True, "none")
         standby = sum(health == "standby" for health in devices.values())

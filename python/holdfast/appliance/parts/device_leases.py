@@ -9,6 +9,7 @@ take them.
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any
@@ -109,6 +110,15 @@ class DeviceLeases(Part):
             }
         }
 
+    def unpolled(self) -> dict[str, str]:
+        """The devices that no node polls, and why. Those of which a lease may be taken soon are not
+        among them. Thread-safe.
+        """
+        found: dict[str, str] = {}
+        for of_log in self._of_log.values():
+            found |= of_log.unpolled()
+        return found
+
     def heartbeats(self) -> list[ThreadHeartbeat]:
         """The heartbeats of the threads. Thread-safe."""
         found = (of_log.heartbeat() for of_log in self._of_log.values())
@@ -156,10 +166,13 @@ class _LogLeases:
         self._servers = nats_servers(settings)
         self._thread = LeaseThread(self.leases, self._connect, f"holdfast-leases-{self.log}")
         self._devices: dict[str, list[str]] = {}
+        self._wanted_since: dict[str, float] = {}
         self._missing: set[tuple[str, str]] = set()
         self._state = _State.STOPPED
 
     def adopt(self, devices: dict[str, list[str]]) -> None:
+        now = time.monotonic()
+        self._wanted_since = {key: self._wanted_since.get(key, now) for key in devices}
         before, self._devices = self._devices, devices
         if self._state is _State.RUNNING:
             self._thread.want(devices)
@@ -184,14 +197,36 @@ class _LogLeases:
     def status(self) -> dict[str, dict[str, Any]]:
         found = {}
         for key, devices in dict(self._devices).items():
-            holder = self.leases.holder(key)
+            holder, unheld = self.leases.holder(key), self._unheld(key)
             for device in devices:
-                known = holder is None or _has(holder, device)
-                found[device] = {
-                    "node": holder.node if holder is not None and known else None,
-                    "polled_here": self.leases.is_held(key),
-                }
+                node, reason = (None, unheld) if holder is None else (holder.node, None)
+                if holder is not None and not _has(holder, device):
+                    node, reason = None, f"{node} has its address, and not this device"
+                is_held = self.leases.is_held(key)
+                found[device] = {"node": node, "polled_here": is_held, "reason": reason}
         return dict(sorted(found.items()))
+
+    def unpolled(self) -> dict[str, str]:
+        reasons = {key: self._unheld(key) for key in dict(self._devices)}
+        return {
+            device: reason
+            for key, reason in reasons.items()
+            if reason is not None
+            for device in self._devices.get(key, ())
+        }
+
+    def _unheld(self, key: str) -> str | None:
+        """Why nobody holds a lease; `None` if somebody does, or may take it soon."""
+        seen = self.leases.seen.get(key)
+        since = max(self._wanted_since.get(key, 0.0), 0.0 if seen is None else seen.seen)
+        is_late = time.monotonic() - since > self.leases.times.unheld_s
+        if not is_late or self.leases.holder(key) is not None:
+            return None
+        if (withheld := self._withheld()) is not None:
+            return withheld
+        if (reason := self.leases.reason) is not None:
+            return f"leases can't be taken: {reason}"
+        return "no node takes its lease"
 
     def taken(self, key: str) -> None:
         for device in self._devices.get(key, ()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,6 +13,9 @@ from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import config_argument, json_option
 from holdfast.cli.terminal_text import print_json, table
 from holdfast.events import log_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 _HEAD = ("node", "last message", "at", "digest of", "digest")
 _DEVICES = ("device", "polled by")
@@ -27,7 +30,8 @@ def log_status(file: Path, as_json: bool) -> None:
     """Show the logs of the appliance that runs FILE on this machine, and the nodes in them.
 
     Exit codes: 0 all logs are well, 1 no appliance of this user runs FILE, 3 a log is not
-    connected, has failed or had no contact within max_lag, or nodes have different contents.
+    connected, has failed or had no contact within max_lag, nodes have different contents, or no
+    node polls a device.
     """
     try:
         found = ask(file, "replicas")["logs"]
@@ -46,7 +50,8 @@ def log_status(file: Path, as_json: bool) -> None:
 
 def _is_well(status: dict[str, Any]) -> bool:
     differs = status["digest"] is not None and status["digest"][2] is False
-    return status["obstacle"] is None and not differs
+    unpolled = any(device["reason"] for device in status["devices"].values())
+    return status["obstacle"] is None and not differs and not unpolled
 
 
 def _shown(name: str, status: dict[str, Any]) -> list[str]:
@@ -70,15 +75,16 @@ def _shown(name: str, status: dict[str, Any]) -> list[str]:
             lines.append(f"  last error: {status['last_error']}")
     rows = (_row(node, status) for node in status["nodes"])
     lines += (f"  {line}" for line in table(_HEAD, rows))
-    devices = status.get("devices")
-    if devices:
-        lines += (f"  {line}" for line in table(_DEVICES, map(_polled, devices.items())))
+    if devices := status["devices"]:
+        rows = (row for device in devices.items() for row in _polled(*device))
+        lines += (f"  {line}" for line in table(_DEVICES, rows))
     return lines
 
 
-def _polled(device: tuple[str, dict[str, Any]]) -> tuple[str, ...]:
-    name, found = device
-    return name, "nobody" if found["node"] is None else found["node"]
+def _polled(device: str, found: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    yield device, "nobody" if found["node"] is None else found["node"]
+    if found["reason"] is not None:
+        yield "", found["reason"]
 
 
 def _row(node: dict[str, Any], status: dict[str, Any]) -> tuple[str, ...]:

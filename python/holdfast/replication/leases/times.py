@@ -30,6 +30,12 @@ class LeaseTimes:
         return self.ttl_s
 
     @property
+    def unheld_s(self) -> float:
+        """So long a lease may be without news and without a holder while all is well: it has ended,
+        the bucket was lost, and another node needs time to take it."""
+        return self.ttl_s + 2 * self.settle_s
+
+    @property
     def server_ttl_s(self) -> int:
         """The TTL of a key, of which servers accept only whole numbers: not before `ttl_s`."""
         return math.ceil(self.ttl_s)
