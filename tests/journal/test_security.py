@@ -65,6 +65,18 @@ def failure(url: str, reason: str, **options: Any) -> str:
     raise AssertionError(f"not {reason}, but {error}")
 
 
+@pytest.mark.parametrize("streams", [1, 2, 3])
+def test_an_account_with_too_few_streams_is_named(
+    serve: Serve, tmp_path: Path, streams: int
+) -> None:
+    limits = f"max_file: 100MB, max_streams: {streams}"
+    account = f"jetstream {{ {limits} }}, users: [{{ user: node, password: secret }}]"
+    file = tmp_path / "nats.conf"
+    file.write_text(f"accounts {{ PLANT {{ {account} }} }}\nno_auth_user: node")
+    started = serve("-c", str(file))
+    failure(started.url, "maximum number of streams reached")
+
+
 def certified(authority: Certificates, name: str) -> list[str]:
     certificate, key = authority.issue(name, "IP:127.0.0.1")
     return ["--tlscert", str(certificate), "--tlskey", str(key)]

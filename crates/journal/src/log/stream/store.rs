@@ -146,12 +146,14 @@ impl Store {
                     num_replicas: settings.replicas,
                     ..object_store::Config::default()
                 };
-                // Fails if another node makes it at the same time.
-                let _ = context.create_object_store(config).await;
-                context
-                    .get_object_store(bucket(""))
-                    .await
-                    .map_err(|error| End::lost("the snapshots of the log", error))?
+                match context.create_object_store(config).await {
+                    Ok(objects) => objects,
+                    // Another node may have made it at the same time.
+                    Err(error) => context
+                        .get_object_store(bucket(""))
+                        .await
+                        .map_err(|_| End::lost("making the snapshots of the log", error))?,
+                }
             }
         };
         Ok(Store { context: context.clone(), stream, keys: pointers, leases, objects })
@@ -460,9 +462,14 @@ async fn keys(
                 num_replicas: settings.replicas,
                 ..kv::Config::default()
             };
-            // Fails if another node makes it at the same time.
-            let _ = context.create_key_value(config).await;
-            context.get_key_value(&bucket).await.map_err(|error| lost(&error))
+            match context.create_key_value(config).await {
+                Ok(keys) => Ok(keys),
+                // Another node may have made it at the same time.
+                Err(error) => context
+                    .get_key_value(&bucket)
+                    .await
+                    .map_err(|_| End::lost("making the keys of the log", error)),
+            }
         }
     }
 }
