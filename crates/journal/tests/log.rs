@@ -220,7 +220,7 @@ fn another_layout_is_refused_and_named() {
     assert_eq!(error.kind(), "layout");
     let expected = "the layout differs from that of the log: memory \"plant\" is coils 0+64, \
                     holding_registers 0+100 in the log, here it is coils 0+64, holding_registers \
-                    0+101";
+                    0+101: correct it, or begin a log with another name";
     assert_eq!(error.to_string(), expected);
 }
 

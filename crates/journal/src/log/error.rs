@@ -14,7 +14,9 @@ pub enum LogError {
     Settings(String),
     #[error("not caught up with the log within {} s: {last}", .within.as_secs_f64())]
     NoConnection { within: Duration, last: String },
-    #[error("the layout differs from that of the log: {0}")]
+    #[error(
+        "the layout differs from that of the log: {0}: correct it, or begin a log with another name"
+    )]
     Layout(String),
     #[error("{what} has version {found}, supported is {supported}: update this node")]
     Version { what: &'static str, found: u8, supported: u8 },
