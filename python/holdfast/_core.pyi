@@ -847,7 +847,10 @@ class Engine:
         """Events that were dropped because the queue was full."""
 
     def next_writes(self, timeout: float, most: int) -> list[dict[str, object]]:
-        """Up to `most` received writes, executed or refused, as fields of an audit log.
+        """About `most` received writes, executed or refused, as fields of an audit log.
+
+        `refusals` of a write that was certainly not carried out is the number of similar ones that
+        it stands for, itself included.
 
         Waits up to `timeout` seconds for the first write. `stop` ends the wait.
         """
@@ -861,6 +864,10 @@ class Engine:
     @property
     def lost_writes(self) -> int:
         """Writes missing from `next_writes` because the queue was full."""
+
+    @property
+    def other_refused_writes(self) -> int:
+        """Refused writes of too many peers, neither in `next_writes` nor in its `refusals`."""
 
     def stop(self) -> None:
         """Answers received requests and stops, within a second. Can be called from any thread."""

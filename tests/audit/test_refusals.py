@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import socket
 from collections import Counter
 from contextlib import closing
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from holdfast.events import log_lines
-from holdfast.events.audit.refusal_summaries import MAX_ORIGINS, Refusals
+from holdfast.events.audit.refusal_summaries import MAX_ORIGINS, WHOLE_WRITES, Refusals
 from holdfast.events.throttle import NOBODY, Throttle, origin
 from support import web, wire
 from support.audits import lines, writes
@@ -132,7 +134,7 @@ def test_requests_without_the_right_are_recorded(run: Run, tmp_path: Path) -> No
         for _ in range(3):
             assert client.get(reading).status == 401
             assert client.ingest([web.command("holding_registers", 0, [7])]).status == 401
-    # This write has a line of its own, and is not a refusal here.
+    # The first refused writes have lines of their own, and are not counted.
     with wire.Connection(endpoint(appliance, "scada")) as client:
         assert client.ask(bytes.fromhex("0600000001")) == bytes.fromhex("8601")
         assert client.ask(bytes.fromhex("03ff000001")) == bytes.fromhex("8302")
@@ -152,6 +154,74 @@ def test_requests_without_the_right_are_recorded(run: Run, tmp_path: Path) -> No
             "function": 3,
             "count": 1,
         }
+    ]
+
+
+@pytest.mark.parametrize("way", ["modbus", "packets", "rest"])
+def test_refused_writes_neither_fill_the_log_nor_refuse_others(
+    run: Run, tmp_path: Path, way: str
+) -> None:
+    reader = {"sources": ["127.0.0.1"], "units": {1: "plant"}, "access": "read-only"}
+    writer = {**reader, "sources": [QUIET], "access": "read-write"}
+    raw = {"sources": ["127.0.0.1"], "units": {1: "plant"}, "areas": ["coils"]}
+    token = {"name": "panel", "sha256": sha256(b"secret").hexdigest(), "memories": ["plant"]}
+    access = {"areas": ["holding_registers"], "access": "read-only"}
+    at = {"bind": "127.0.0.1:0"}
+    appliance = run(
+        configured(
+            listeners={
+                "scada": {"type": "modbus-tcp", **at, "rules": [reader, writer]},
+                "raw": {"type": "raw-ingest", "format": "v1", **at, "rules": [raw]},
+            },
+            rest={**at, "sources": ["127.0.0.1"], "tokens": [{**token, **access}]},
+            audit={"file": "audit.log", "fail": "closed"},
+        )
+    )
+    count = WHOLE_WRITES + 5
+    command = {**web.command("holding_registers", 0, [7]), "memory": "plant"}
+    if way == "modbus":
+        with wire.Connection(endpoint(appliance, "scada")) as client:
+            for _ in range(count):
+                assert client.ask(bytes.fromhex("0600000001")) == bytes.fromhex("8601")
+    elif way == "packets":
+        for _ in range(count):
+            with socket.create_connection(endpoint(appliance, "raw"), wire.DEADLINE) as sender:
+                sender.sendall(bytes.fromhex("5249010300010000000100070000"))
+                assert sender.recv(1) == b"\x01"
+    else:
+        with closing(web.Client(endpoint(appliance, "rest"), "secret")) as client:
+            for _ in range(count):
+                assert client.ingest(command).status == 403
+    with wire.Connection(endpoint(appliance, "scada"), source=QUIET) as other:
+        assert other.ask(bytes.fromhex("0600000001")) == bytes.fromhex("0600000001")
+    appliance.stop()
+    outcomes = Counter(line["outcome"] for line in writes(tmp_path / "audit.log"))
+    assert outcomes.pop("done") == 1
+    [outcome] = outcomes
+    assert outcomes[outcome] == WHOLE_WRITES
+    [found] = [line for line in refused(tmp_path) if line["event"] == "refused_write"]
+    listener = {"modbus": "scada", "packets": "raw", "rest": "rest"}[way]
+    common = {"event": "refused_write", "listener": listener, "outcome": outcome}
+    assert {**common, "peer": "127.0.0.1", "count": 5}.items() <= found.items()
+
+
+def test_refused_writes_of_many_sources_are_counted() -> None:
+    refusals = Refusals(interval=3600)
+
+    def write(number: int) -> dict[str, object]:
+        return {"listener": "scada", "peer": f"10.0.0.{number}:1", "outcome": "illegal_function"}
+
+    assert all(refusals.has_line(write(1)) for _ in range(WHOLE_WRITES))
+    assert not refusals.has_line(write(1), 7)
+    assert refusals.has_line(write(2), 3)
+    refusals.note_others(9)
+    common = {"event": "refused_write", "listener": "scada", "outcome": "illegal_function"}
+    others = {"event": "refused_write", "peer": "others"}
+    assert refusals.take() == [{**others, "count": 1}]
+    assert refusals.rest() == [
+        {**others, "count": 8},
+        {**common, "peer": "10.0.0.1", "count": 7},
+        {**common, "peer": "10.0.0.2", "count": 2},
     ]
 
 

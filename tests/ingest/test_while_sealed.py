@@ -167,7 +167,7 @@ class OpeningAudit:
     def require(self) -> None:
         self.memory.write("discrete_inputs", 7, [1])
 
-    def write(self, **line: object) -> None:
+    def write_refused(self, **line: object) -> None:
         self.outcomes.append(line["outcome"])
 
     def queue(self, lines: Any) -> list[Any]:

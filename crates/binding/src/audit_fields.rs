@@ -66,6 +66,9 @@ pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, P
     if let Some(sequence) = record.log_sequence {
         line.set_item("log_sequence", sequence)?;
     }
+    if record.refusals > 0 {
+        line.set_item("refusals", record.refusals)?;
+    }
     Ok(line)
 }
 

@@ -135,6 +135,11 @@ impl Engine {
     }
 
     #[getter]
+    fn other_refused_writes(&self) -> u64 {
+        self.core.other_refused_writes()
+    }
+
+    #[getter]
     fn lost_events(&self) -> u64 {
         self.core.lost_events()
     }

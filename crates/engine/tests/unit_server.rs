@@ -88,7 +88,7 @@ fn ask(
     request: &[u8],
 ) -> Option<Vec<u8>> {
     let mut reply = [0; pdu::MAX_LEN];
-    let len = unit_server.answer(rights, unit_id, request, true, &mut reply)?;
+    let len = unit_server.answer(rights, unit_id, request, || true, &mut reply)?;
     Some(reply[..len].to_vec())
 }
 
@@ -264,7 +264,7 @@ fn a_write_that_is_not_permitted_is_refused_after_rights_and_form_and_before_the
     let rights = rights(&[(7, &one)], AccessMode::ReadWrite);
     let refused = |unit_id, request: &[u8]| {
         let mut reply = [0; pdu::MAX_LEN];
-        let len = unit_server.answer(&rights, unit_id, request, false, &mut reply).unwrap();
+        let len = unit_server.answer(&rights, unit_id, request, || false, &mut reply).unwrap();
         (reply[0] >= 0x80).then(|| reply[..len][1])
     };
     assert_eq!(refused(7, WRITE), Some(4));
@@ -275,6 +275,20 @@ fn a_write_that_is_not_permitted_is_refused_after_rights_and_form_and_before_the
     let replies = broadcast_if(&unit_server, &rights, WRITE, None);
     assert_eq!(replies, [(vec![WRITE[0] | 0x80, 4], None, None)]);
     assert_eq!(ask(&unit_server, &rights, 7, READ), before);
+}
+
+#[test]
+fn a_write_that_a_peer_may_not_send_takes_no_room_in_the_audit_log() {
+    let (one, unit_server) = (memory(1), unit_server());
+    let read_only = rights(&[(7, &one)], AccessMode::ReadOnly);
+    let read_write = rights(&[(7, &one)], AccessMode::ReadWrite);
+    let outside = within(&one, &[(0, 1)], &[(5, 1)]);
+    let mut reply = [0; pdu::MAX_LEN];
+    for (rights, unit_id) in [(&read_only, 7), (&read_write, 9), (&outside, 7)] {
+        let unasked = || panic!("the permit takes room");
+        unit_server.answer(rights, unit_id, WRITE, unasked, &mut reply).unwrap();
+        assert_eq!(reply[0], WRITE[0] | 0x80);
+    }
 }
 
 /// Carries out each step at once, at the next sequence from 7 on, or refuses it.
@@ -313,7 +327,7 @@ fn a_broadcast_waits_for_journals_and_is_recorded_with_their_sequences() {
     assert_eq!(replies, expected);
     assert_eq!((unit_server.counters.bus().exceptions, unit_server.counters.bus().events), (1, 0));
     let read_only = rights(&[(7, &kept)], AccessMode::ReadOnly);
-    let refused = (vec![WRITE[0] | 0x80, 1], None, Some(()));
+    let refused = (vec![WRITE[0] | 0x80, 1], None, None);
     assert_eq!(broadcast_if(&unit_server, &read_only, WRITE, Some(())), [refused]);
 }
 

@@ -25,6 +25,7 @@ from holdfast.ingest.audit_lines import Recording, origin_around, values_of
 from holdfast.ingest.counts import Counts
 from holdfast.ingest.refusals import (
     KEEPING,
+    UNCERTAIN,
     Refused,
     malformed,
     place_of,
@@ -276,7 +277,8 @@ class MemoryAccess:
         by_nobody = refused.reason == "unauthorized"
         self._note(refused, who, peer, observed=by_nobody, throttle=throttle)
         if self._audit is not None and not refused.is_recorded and not by_nobody:
-            self._audit.write(
+            write = self._audit.write if refused.reason in UNCERTAIN else self._audit.write_refused
+            write(
                 listener=self.name,
                 peer=peer,
                 source=who,

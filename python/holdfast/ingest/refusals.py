@@ -48,6 +48,9 @@ KEEPING = {
 }
 """Why memories that are kept refuse writes."""
 
+UNCERTAIN = ("device_refused", "internal_error")
+"""Reasons with which a write may have been carried out all the same."""
+
 
 def unreadable(error: OSError) -> str:
     """The reason why a memory can't be read."""

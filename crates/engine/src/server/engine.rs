@@ -398,7 +398,7 @@ impl Engine {
         self.reporter.set_verbosity(verbosity);
     }
 
-    /// Takes up to `most` writes for the audit log. Waits up to `timeout` for the first.
+    /// Takes about `most` writes for the audit log. Waits up to `timeout` for the first.
     pub fn next_writes(&self, timeout: Duration, most: usize) -> Vec<Record> {
         self.records.as_ref().map_or_else(Vec::new, |records| records.take(timeout, most))
     }
@@ -414,6 +414,11 @@ impl Engine {
     /// The number of writes that were dropped because the audit queue was full.
     pub fn lost_writes(&self) -> u64 {
         self.records.as_ref().map_or(0, Records::lost)
+    }
+
+    /// The number of refused writes that are neither among the writes for the audit log nor counted there.
+    pub fn other_refused_writes(&self) -> u64 {
+        self.records.as_ref().map_or(0, Records::other_refused)
     }
 
     /// The next event, if one arrives within `timeout`.

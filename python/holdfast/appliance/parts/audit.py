@@ -5,14 +5,13 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from holdfast._core import __version__
 from holdfast.appliance.parts.part import Part
 from holdfast.config.values.urls import parse_syslog
 from holdfast.events import log_lines
 from holdfast.events.audit import Audit, Copies, Journal, Syslog
-from holdfast.events.audit.refusal_summaries import Refusals
 from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
 from holdfast.runtime.standstill import WallClock
 from holdfast.runtime.text import file_error_text
@@ -111,9 +110,9 @@ class WriteRecorder:
     def __init__(self, audit: Audit, engine: Engine) -> None:
         self._audit = audit
         self._engine = engine
-        self._refusals = Refusals()
+        self._refusals = audit.refusals
         self._events: deque[dict[str, object]] = deque()
-        self._lost = 0
+        self._lost = self._others = 0
         self._stopped = threading.Event()
         self._heartbeat = Heartbeat()
         self._thread = threading.Thread(target=self._run, name="holdfast-audit")
@@ -149,13 +148,25 @@ class WriteRecorder:
                 self._audit.retry()
                 continue
             writes = self._engine.next_writes(0 if ended else TIMEOUT_S, BATCH)
+            lines = [write for write in writes if self._has_line(write)]
+            self._count_others()
             more = self._refusals.rest() if ended else self._refusals.take()
             while self._events:
                 more.append(self._events.popleft())
-            self._audit.write_all([*writes, *more], done=True)
+            self._audit.write_all([*lines, *more], done=True)
             self._log_lost()
             if ended and not writes:
                 return
+
+    def _has_line(self, write: dict[str, object]) -> bool:
+        times = cast("int", write.pop("refusals", 0))
+        return not times or self._refusals.has_line(write, times)
+
+    def _count_others(self) -> None:
+        others = self._engine.other_refused_writes
+        if others > self._others:
+            self._refusals.note_others(others - self._others)
+            self._others = others
 
     def _log_lost(self) -> None:
         missed = self._engine.lost_writes

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from holdfast.events import log_lines
 from holdfast.events.audit.chain import BREAK, End, Record, chained, encoded, unchained
 from holdfast.events.audit.file import AuditFile
+from holdfast.events.audit.refusal_summaries import Refusals
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -57,6 +58,8 @@ class Audit:
         copies: Sequence[Copies] = (),
     ) -> None:
         self.fail_closed = fail_closed
+        self.refusals = Refusals()
+        """The refusals that are counted. Whoever takes them writes their lines."""
         self._file = None if file is None else AuditFile(file, max_bytes=max_bytes, keep=keep)
         self._copies = copies
         self._lock = threading.Lock()
@@ -72,6 +75,11 @@ class Audit:
     def write(self, **fields: object) -> None:
         """Writes one line: the time, its place in the chain, then the fields."""
         self.write_all([fields])
+
+    def write_refused(self, **fields: object) -> None:
+        """Writes or counts a write that was refused, and that changed nothing."""
+        if self.refusals.has_line(fields):
+            self.write(**fields)
 
     def write_all(self, lines: Iterable[Line], *, done: bool = False) -> None:
         """Writes lines, all with the present time.

@@ -1,6 +1,6 @@
-"""Which refusals besides those of writes the audit log has, and how many lines they get.
+"""Which refusals the audit log has, and how many lines they get.
 
-A refused write has a line of its own.
+Of refused writes, the first ones have whole lines. All others are counted.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, cast
 
-from holdfast.events.throttle import Origin, Throttle
+from holdfast.events.throttle import OTHERS, Origin, Throttle, origin
 from holdfast.protocol import OF_CODE
 
 if TYPE_CHECKING:
@@ -23,6 +23,13 @@ MAX_ORIGINS = 250
 
 # The subjects of one source that are distinguished in an interval.
 MAX_SUBJECTS_OF_SOURCE = 16
+
+# The refused writes of a listener that have whole lines in an interval, for each reason. The first
+# one of each origin has one in any case.
+WHOLE_WRITES = 20
+
+# A number of refused writes.
+WRITES = "refused_write"
 
 # The fields that the refusals of a kind have in common.
 KIND = ("listener", "adapter", "reason", "role")
@@ -50,19 +57,22 @@ class Refusals:
 
     The first refusal is a line at once, the others are one line at the end of the interval. So
     whoever is refused can't fill a disk, or push other lines out of the file. Thread-safe.
-    `note` does not wait.
+    `note` and `has_line` do not wait.
     """
 
     def __init__(self, interval: float = INTERVAL_S) -> None:
-        self._counts = Throttle(
-            burst=0, window=interval, most=MAX_ORIGINS, of_source=MAX_SUBJECTS_OF_SOURCE
+        self._counts, self._writes = (
+            Throttle(burst, interval, MAX_ORIGINS, MAX_SUBJECTS_OF_SOURCE)
+            for burst in (0, WHOLE_WRITES)
         )
         self._first: deque[dict[str, object]] = deque()
 
     def note(self, event: str, fields: Mapping[str, object], by: Origin, times: int = 1) -> None:
         """Counts a refusal, if it is one that the audit log has. See `log_lines.observe`."""
-        if not _is_audited(event, fields):
-            return
+        if _is_audited(event, fields):
+            self._note(event, fields, by, times)
+
+    def _note(self, event: str, fields: Mapping[str, object], by: Origin, times: int) -> None:
         kind = (("event", event), *((key, fields[key]) for key in KIND if key in fields))
         is_first, before = self._counts.admit(kind, time.monotonic(), by, times)
         if is_first:
@@ -70,13 +80,27 @@ class Refusals:
                 self._first.append(_line((kind, by, before)))
             self._first.append({"event": event, **fields, "count": 1})
 
+    def has_line(self, write: Mapping[str, object], times: int = 1) -> bool:
+        """Counts a refused write that occurred several `times`. Returns whether to log it."""
+        kind = (("event", WRITES), *((key, write[key]) for key in ("listener", "outcome")))
+        by = origin(WRITES, write)
+        is_whole, before = self._writes.admit(kind, time.monotonic(), by, times)
+        if is_whole and before:
+            self._first.append(_line((kind, by, before)))
+        return is_whole
+
+    def note_others(self, times: int) -> None:
+        """Counts refused writes of which nothing else is known."""
+        self._note(WRITES, {"peer": OTHERS}, Origin(OTHERS), times)
+
     def take(self) -> list[dict[str, object]]:
         """Returns the lines that are due."""
-        return [*self._taken(), *map(_line, self._counts.over(time.monotonic()))]
+        now = time.monotonic()
+        return [*self._taken(), *map(_line, (*self._counts.over(now), *self._writes.over(now)))]
 
     def rest(self) -> list[dict[str, object]]:
         """Returns the lines of all refusals, also before the end of the interval."""
-        return [*self._taken(), *map(_line, self._counts.rest())]
+        return [*self._taken(), *map(_line, (*self._counts.rest(), *self._writes.rest()))]
 
     def _taken(self) -> Iterator[dict[str, object]]:
         while self._first:
@@ -86,7 +110,7 @@ class Refusals:
 def _is_audited(event: str, fields: Mapping[str, object]) -> bool:
     if event in REQUESTS:
         function = OF_CODE.get(cast("int", fields.get("function")))
-        # A write has a line of its own: crates/engine/src/server/reports/audit.rs.
+        # The engine gives writes to `has_line`: crates/engine/src/server/reports/audit.rs.
         return function is None or not function.writes
     return event in CONNECTIONS or (event, fields.get("reason")) in DENIALS
 

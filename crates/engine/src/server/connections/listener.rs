@@ -76,7 +76,8 @@ impl ListenerContext {
         ListenerContext::new("test", None, reporter, None)
     }
 
-    /// Permits a request to a memory. `None` if it can't be recorded, although it must.
+    /// Permits a request to a memory that the peer may send: refused requests must take no room. `None` if
+    /// it can't be recorded, although it must.
     #[inline]
     pub(crate) fn permit(&self, request: &[u8]) -> Option<Permit> {
         self.permitted(|auditor| auditor.permit(is_write(request), request))
@@ -190,8 +191,12 @@ impl ListenerContext {
             self.connections.refused_listen_only.add();
             self.report(Kind::RefusedListenOnly, peer.cloned());
         }
-        let permit = self.permit(request);
-        let len = unit_server.answer(rights, unit_id, request, permit.is_some(), reply);
+        let mut permit = None;
+        let ask = || {
+            permit = self.permit(request);
+            permit.is_some()
+        };
+        let len = unit_server.answer(rights, unit_id, request, ask, reply);
         let answered = &reply[..len.unwrap_or_default()];
         let refused = RefusedRequest::by(rights, unit_id, request, answered);
         if let Some(auditor) = &self.auditor {

@@ -47,6 +47,7 @@ pub(in crate::server) struct Asked {
     /// The device that the request was passed on to; `None` if it was refused, or is of a memory.
     route: Option<Arc<str>>,
     request: Vec<u8>,
+    /// `None` if it was refused.
     permit: Option<Permit>,
 }
 
@@ -106,8 +107,8 @@ impl Deferred {
         };
         let asker = Asker { source: self.source, peer: Some(peer) };
         let (asked, reply, refused) =
-            Asked::send(context, place, (tag, unit_id, request), |permitted| {
-                unit_server.forward(rights, place, &asker, unit_id, request, permitted)
+            Asked::send(context, place, (tag, unit_id, request), |permit| {
+                unit_server.forward(rights, place, &asker, unit_id, request, permit)
             });
         let is_step = matches!(place, Elsewhere::Journal(_));
         self.waiting.push_back(Waiting { asked, reply, is_step });
@@ -172,16 +173,21 @@ impl Waiting {
 }
 
 impl Asked {
-    /// Sends a request on its way by `forward`, which gets whether it is permitted. It may be refused
-    /// at once.
+    /// Sends a request on its way by `forward`, which asks for a permit before. It may be refused at once.
     pub(in crate::server) fn send(
         context: &ListenerContext,
         place: &Elsewhere,
         (tag, unit_id, request): (u16, u8, &[u8]),
-        forward: impl FnOnce(bool) -> Result<(Option<Arc<str>>, PendingReply), ExceptionCode>,
+        forward: impl FnOnce(
+            &mut dyn FnMut() -> bool,
+        ) -> Result<(Option<Arc<str>>, PendingReply), ExceptionCode>,
     ) -> (Asked, Expected, Option<RefusedRequest>) {
-        let permit = context.permit_forwarded(request);
-        let sent = forward(permit.is_some());
+        let mut permit = None;
+        let sent = forward(&mut || {
+            permit = context.permit_forwarded(request);
+            permit.is_some()
+        });
+        let permit = permit.filter(|_| sent.is_ok());
         let refused = RefusedRequest::before_sending(place, unit_id, request, &sent);
         let (route, reply) = match sent {
             Ok((route, pending)) => (route, Expected::Pending(pending)),

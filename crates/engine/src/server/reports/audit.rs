@@ -1,6 +1,9 @@
 //! Writes, for an audit log. Sending never blocks. When the queue is full, records are dropped and
 //! counted, or the writes are refused: then each write takes room for its record before it is carried
 //! out.
+//!
+//! Refused writes take no room from the others: whoever may not write can send any number of them. Few
+//! of them wait, and the others are only counted.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, Sender, channel};
@@ -20,6 +23,12 @@ const MAX_QUEUE_BYTES: usize = 32 << 20;
 /// Bytes of a record without its data.
 const RECORD_OVERHEAD_BYTES: usize = 128;
 
+/// The most refused writes that wait, each with its request.
+const MAX_REFUSED: usize = 128;
+
+/// As many more may wait if none of these is similar. Each stands for all that are similar to it.
+const MAX_SIMILAR: usize = 128;
+
 /// What happens to a write that can't be recorded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Unrecordable {
@@ -38,6 +47,9 @@ pub struct Record {
     pub write: Written,
     /// Where the log of a memory has the write.
     pub log_sequence: Option<u64>,
+    /// The number of similar refused writes that this one stands for, itself included. 0 if the write
+    /// may have been carried out: then it has a line of its own.
+    pub refusals: u64,
 }
 
 /// A request that was answered elsewhere, and its reply. `route` is the name of the device that it was
@@ -88,7 +100,7 @@ struct Room {
 /// The receiving side.
 #[derive(Debug)]
 pub(crate) struct Records {
-    /// `None` only wakes the reader of the queue.
+    /// `None` wakes the reader of the queue. Refused writes are in its place.
     receiver: Mutex<Receiver<Option<Record>>>,
     /// Keeps the channel open without listeners: the reader of the queue must still wait then.
     sender: Sender<Option<Record>>,
@@ -100,6 +112,10 @@ struct Shared {
     /// The size of the records in the queue, and of the room that is taken.
     waiting: AtomicUsize,
     lost: AtomicU64,
+    /// Refused writes, until they are taken.
+    refused: Mutex<Vec<Record>>,
+    /// The refused writes that are neither in records nor counted in them.
+    other_refused: AtomicU64,
     /// Whether the log can't be written at present.
     failing: AtomicBool,
 }
@@ -133,7 +149,8 @@ impl Auditor {
         (waiting <= MAX_QUEUE_BYTES).then_some(Permit { room: Some(room) })
     }
 
-    /// Records a Modbus request if it writes. `reply` is its reply; empty when there is none.
+    /// Records a Modbus request to a memory if it writes. `reply` is its reply; empty when there is none.
+    /// A request without a permit was not carried out.
     pub(crate) fn note(
         &self,
         listener: &Arc<str>,
@@ -144,12 +161,19 @@ impl Auditor {
     ) {
         if is_write(request) {
             let answered = Forwarded { route: None, request, reply, log_sequence: None };
-            self.send(record(listener, peer, unit_id, answered), permit);
+            let record = || record(listener, peer, unit_id, answered);
+            match permit {
+                Some(permit) if exception_in(reply).is_none() => self.send(record(), permit),
+                // The unit ignores it in listen only mode.
+                None if reply.is_empty() => {}
+                _ => self.refuse(record()),
+            }
         }
     }
 
     /// Records a request to a device or a journal, unless it is known to only read. Its reply is what
-    /// was answered there, or in its place.
+    /// was answered there, or in its place. Without a permit, it was not sent; otherwise it may have been
+    /// carried out, whatever the reply.
     pub(crate) fn note_forwarded(
         &self,
         listener: &Arc<str>,
@@ -159,14 +183,39 @@ impl Auditor {
         permit: Option<Permit>,
     ) {
         if !only_reads(forwarded.request) {
-            self.send(record(listener, peer, unit_id, forwarded), permit);
+            let record = record(listener, peer, unit_id, forwarded);
+            match permit {
+                Some(permit) => self.send(record, permit),
+                None => self.refuse(record),
+            }
+        }
+    }
+
+    /// Queues the record of a write that was not carried out, or counts it. It takes no room from others.
+    pub(crate) fn refuse(&self, record: Record) {
+        let mut refused = lock(&self.shared.refused);
+        if refused.len() >= MAX_REFUSED {
+            if let Some(similar) = refused.iter_mut().rev().find(|other| other.is_similar(&record))
+            {
+                similar.refusals += 1;
+                return;
+            }
+            if refused.len() >= MAX_REFUSED + MAX_SIMILAR {
+                self.shared.other_refused.fetch_add(1, Ordering::Relaxed);
+                return;
+            }
+        }
+        refused.push(Record { refusals: 1, ..record });
+        if refused.len() == 1 {
+            // An error means that the engine has stopped.
+            let _ = self.sender.send(None);
         }
     }
 
     /// Queues a record, in the room that the permit has taken, if it has.
-    pub(crate) fn send(&self, record: Record, permit: Option<Permit>) {
+    pub(crate) fn send(&self, record: Record, permit: Permit) {
         let size = record.size();
-        if let Some(mut room) = permit.and_then(|permit| permit.room) {
+        if let Some(mut room) = permit.room {
             debug_assert_eq!(room.size, size);
             // The room belongs to the record now, until the record is taken.
             room.size = 0;
@@ -197,7 +246,7 @@ fn record(
     let Forwarded { route, request, reply, log_sequence } = forwarded;
     let refused = exception_in(reply);
     let write = Written::Modbus { unit_id, pdu: request.to_vec(), refused, route: route.cloned() };
-    Record { listener: Arc::clone(listener), peer: peer.cloned(), write, log_sequence }
+    Record { listener: Arc::clone(listener), peer: peer.cloned(), write, log_sequence, refusals: 0 }
 }
 
 impl Record {
@@ -208,16 +257,47 @@ impl Record {
                 Written::Packet { payload, .. } => payload.len(),
             }
     }
+
+    /// Whether a refused write is of the same peer, and was refused for the same reason.
+    fn is_similar(&self, other: &Record) -> bool {
+        let is_same_reason = match (&self.write, &other.write) {
+            (Written::Modbus { refused, .. }, Written::Modbus { refused: other, .. }) => {
+                refused == other
+            }
+            (Written::Packet { refused, .. }, Written::Packet { refused: other, .. }) => {
+                refused == other
+            }
+            _ => false,
+        };
+        is_same_reason
+            && self.listener == other.listener
+            && match (&self.peer, &other.peer) {
+                (Some(peer), Some(other)) => {
+                    peer.ip() == other.ip() && peer.certificate == other.certificate
+                }
+                (peer, other) => peer.is_none() && other.is_none(),
+            }
+    }
 }
 
 impl Records {
-    /// Takes up to `most` records. Waits up to `timeout` for the first, and not for the others.
+    /// Takes about `most` records. Waits up to `timeout` for the first, and not for the others.
     pub(crate) fn take(&self, timeout: Duration, most: usize) -> Vec<Record> {
         let receiver = lock(&self.receiver);
         let first = receiver.recv_timeout(timeout).ok();
-        let records: Vec<Record> =
-            first.into_iter().chain(receiver.try_iter()).flatten().take(most).collect();
-        let size = records.iter().map(Record::size).sum();
+        let (mut records, mut size) = (Vec::new(), 0);
+        for record in first.into_iter().chain(receiver.try_iter()) {
+            match record {
+                Some(record) => {
+                    size += record.size();
+                    records.push(record);
+                }
+                None => records.append(&mut lock(&self.shared.refused)),
+            }
+            if records.len() >= most {
+                break;
+            }
+        }
         self.shared.waiting.fetch_sub(size, Ordering::Relaxed);
         records
     }
@@ -238,10 +318,16 @@ impl Records {
     pub(crate) fn lost(&self) -> u64 {
         self.shared.lost.load(Ordering::Relaxed)
     }
+
+    /// The number of refused writes that are neither in records nor counted in them.
+    pub(crate) fn other_refused(&self) -> u64 {
+        self.shared.other_refused.load(Ordering::Relaxed)
+    }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::net::{IpAddr, Ipv4Addr, SocketAddr};
     use std::time::Instant;
 
     use super::*;
@@ -249,8 +335,14 @@ mod tests {
     const WRITE: &[u8] = &[6, 0, 1, 0, 7];
     const READ: &[u8] = &[3, 0, 1, 0, 1];
 
-    fn send(auditor: &Auditor, permit: Option<Permit>) {
-        auditor.note(&"scada".into(), None, 1, (WRITE, WRITE), permit);
+    fn send(auditor: &Auditor, permit: Permit) {
+        auditor.note(&"scada".into(), None, 1, (WRITE, WRITE), Some(permit));
+    }
+
+    /// Notes a write that was refused with this exception.
+    fn refuse(auditor: &Auditor, peer: IpAddr, exception: u8) {
+        let peer = SocketAddr::new(peer, 50_000).into();
+        auditor.note(&"scada".into(), Some(&peer), 1, (WRITE, &[0x86, exception]), None);
     }
 
     #[test]
@@ -263,7 +355,7 @@ mod tests {
         assert!(auditor.permit(true, &[0, 1]).is_none());
         assert!(auditor.permit(false, READ).is_some());
         for permit in permits {
-            send(&auditor, Some(permit));
+            send(&auditor, permit);
         }
         assert_eq!((records.take(Duration::ZERO, usize::MAX).len(), records.lost()), (most, 0));
         assert!(auditor.permit(true, WRITE).is_some());
@@ -283,13 +375,62 @@ mod tests {
             let (auditor, records) = auditing(unrecordable);
             let most = MAX_QUEUE_BYTES / (RECORD_OVERHEAD_BYTES + WRITE.len()) + 1;
             for _ in 0..most + 5 {
-                send(&auditor, None);
+                send(&auditor, Permit::default());
             }
             assert_eq!(records.lost(), 5);
             assert_eq!(auditor.permit(true, WRITE).is_some(), unrecordable == Unrecordable::Write);
             assert_eq!(records.take(Duration::ZERO, usize::MAX).len(), most);
             assert!(auditor.permit(true, WRITE).is_some());
         }
+    }
+
+    #[test]
+    fn refused_writes_take_no_room_and_are_counted() {
+        let (auditor, records) = auditing(Unrecordable::Refuse);
+        let most = MAX_QUEUE_BYTES / RECORD_OVERHEAD_BYTES;
+        let [noisy, quiet] = [7, 8].map(|last| IpAddr::from([127, 0, 0, last]));
+        for _ in 0..most {
+            refuse(&auditor, noisy, 1);
+        }
+        refuse(&auditor, quiet, 1);
+        refuse(&auditor, noisy, 2);
+        assert_eq!(records.shared.waiting.load(Ordering::Relaxed), 0);
+        send(&auditor, auditor.permit(true, WRITE).unwrap());
+        let taken = records.take(Duration::ZERO, usize::MAX);
+        assert_eq!((records.lost(), records.other_refused()), (0, 0));
+        let (last, refused) = taken.split_last().unwrap();
+        assert_eq!((last.refusals, refused.len()), (0, MAX_REFUSED + 2));
+        assert_eq!(refused[MAX_REFUSED - 1].refusals, (most - MAX_REFUSED + 1) as u64);
+        assert!(refused[MAX_REFUSED..].iter().all(|each| each.refusals == 1));
+        refuse(&auditor, noisy, 1);
+        assert_eq!(records.take(Duration::ZERO, usize::MAX).len(), 1);
+    }
+
+    #[test]
+    fn refused_writes_of_too_many_peers_are_counted_together() {
+        let (auditor, records) = auditing(Unrecordable::Write);
+        for number in 0..1000 {
+            refuse(&auditor, Ipv4Addr::from(number).into(), 1);
+        }
+        let most = MAX_REFUSED + MAX_SIMILAR;
+        assert_eq!(records.take(Duration::ZERO, usize::MAX).len(), most);
+        assert_eq!(records.other_refused(), 1000 - most as u64);
+    }
+
+    #[test]
+    fn a_write_that_may_have_been_carried_out_is_not_counted_as_refused() {
+        let (auditor, records) = auditing(Unrecordable::Write);
+        let sent = |permit| {
+            let reply = &[0x86, 0x0B];
+            let forwarded = Forwarded { route: None, request: WRITE, reply, log_sequence: None };
+            auditor.note_forwarded(&"scada".into(), None, 1, forwarded, permit);
+        };
+        sent(auditor.permit(true, WRITE));
+        sent(None);
+        // A unit in listen only mode has ignored it.
+        auditor.note(&"scada".into(), None, 1, (WRITE, &[]), None);
+        let refusals = records.take(Duration::ZERO, 10).into_iter().map(|each| each.refusals);
+        assert_eq!(refusals.collect::<Vec<_>>(), [0, 1]);
     }
 
     #[test]

@@ -75,21 +75,22 @@ impl UnitServer {
     }
 
     /// Carries out a request and writes the reply. Returns its length, or `None` when there is no
-    /// reply. A request that is not `permitted` could not be recorded, and is refused.
+    /// reply. `permit` is asked before a request is carried out that the peer may send; without a permit,
+    /// it could not be recorded, and is refused.
     #[inline]
     pub fn answer(
         &self,
         rights: &PeerRights,
         unit_id: u8,
         request: &[u8],
-        permitted: bool,
+        permit: impl FnOnce() -> bool,
         reply: &mut Buffer,
     ) -> Option<usize> {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
         let logs = self.comm_events.is_on();
         let was_silent = logs && self.receive(unit_id);
-        let served = self.serve(rights, unit_id, (function_code, request), permitted, reply);
+        let served = self.serve(rights, unit_id, (function_code, request), permit, reply);
         if logs {
             self.note_served(unit_id, request, was_silent, &served);
         }
@@ -176,7 +177,8 @@ impl UnitServer {
         })
     }
 
-    /// Sends a request on its way to a device or a journal. Returns also the name of the device.
+    /// Sends a request on its way to a device or a journal. Returns also the name of the device. `permit`
+    /// is asked as by `answer`.
     ///
     /// # Errors
     /// The exception to answer it with.
@@ -187,7 +189,7 @@ impl UnitServer {
         asker: &Asker,
         unit_id: u8,
         request: &[u8],
-        permitted: bool,
+        permit: &mut dyn FnMut() -> bool,
     ) -> Result<(Option<Arc<str>>, PendingReply), ExceptionCode> {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
@@ -195,16 +197,17 @@ impl UnitServer {
         let sent = match place {
             _ if !rights.allows(unit_id, function_code) => Err(NOT_ALLOWED),
             Elsewhere::Device(_) if rights.denies(unit_id, request) => Err(NOT_ALLOWED),
-            Elsewhere::Journal(_) if !permitted => {
-                Err(Request::parse(request).err().unwrap_or(ExceptionCode::ServerDeviceFailure))
-            }
-            _ if !permitted => Err(ExceptionCode::ServerDeviceFailure),
             Elsewhere::Mirror(passage) if outside(rights, unit_id, request) => {
                 Err(out_of_ranges(&passage.memory))
             }
             Elsewhere::Journal(memory) if outside(rights, unit_id, request) => {
                 Err(out_of_ranges(memory))
             }
+            _ if !permit() => Err(match place {
+                Elsewhere::Journal(_) => Request::parse(request).err(),
+                _ => None,
+            }
+            .unwrap_or(ExceptionCode::ServerDeviceFailure)),
             Elsewhere::Device(route) => route
                 .ask(asker, unit_id, request)
                 .map(|pending| (Some(Arc::clone(&route.name)), pending)),
@@ -241,8 +244,8 @@ impl UnitServer {
     }
 
     /// Carries out a broadcast write (Serial Line V1.02, 2.1). It counts as one message without a
-    /// reply, even if several memories carry it out. `permit` is asked before each, and `note` receives
-    /// the permit, the reply that each would have sent, and where a log has the write. A journal is
+    /// reply, even if several memories carry it out. `permit` is asked before each that the peer may write, and
+    /// `note` receives the permit if the write may have been carried out, the reply that each would have sent, and where a log has the write. A journal is
     /// waited for, because what follows on the line expects the effects.
     pub async fn broadcast<P>(
         &self,
@@ -261,15 +264,16 @@ impl UnitServer {
         for unit_id in
             rights.one_unit_of_each_memory(|unit_id| !self.listen_only.is_on(unit_id), may)
         {
-            let permit = permit();
-            let journal = rights
-                .memory(unit_id)
-                .filter(|memory| memory.has_journal() && permit.is_some() && may(unit_id));
+            let mut permit = may(unit_id).then(&mut permit).flatten();
+            let journal =
+                rights.memory(unit_id).filter(|memory| memory.has_journal() && permit.is_some());
             let (reply, log_sequence) = match journal {
                 Some(memory) => journaled_write::carry_out(memory, request).await,
                 None => {
                     let (mut reply, asked) = ([0; pdu::MAX_LEN], (function_code, request));
-                    let done = self.serve(rights, unit_id, asked, permit.is_some(), &mut reply);
+                    let is_permitted = permit.is_some();
+                    let done = self.serve(rights, unit_id, asked, || is_permitted, &mut reply);
+                    permit = permit.filter(|_| done.is_ok());
                     let len = match done {
                         Ok(len) => len.unwrap_or_default(),
                         Err(code) => reply::exception(function_code, code, &mut reply),
@@ -297,7 +301,7 @@ impl UnitServer {
         rights: &PeerRights,
         unit_id: u8,
         (function_code, pdu): (u8, &[u8]),
-        permitted: bool,
+        permit: impl FnOnce() -> bool,
         reply: &mut Buffer,
     ) -> Result<Option<usize>, ExceptionCode> {
         let request = Request::parse(pdu);
@@ -317,11 +321,11 @@ impl UnitServer {
         }
         let memory = memory.ok_or(ExceptionCode::GatewayTargetFailedToRespond)?;
         let request = request?;
-        if !permitted {
-            return Err(ExceptionCode::ServerDeviceFailure);
-        }
         if rights.ranges(unit_id).is_some_and(|ranges| !ranges.allow(&request)) {
             return Err(out_of_ranges(memory));
+        }
+        if !permit() {
+            return Err(ExceptionCode::ServerDeviceFailure);
         }
         match request {
             Request::ReadCoils(range) => {

@@ -389,7 +389,7 @@ impl RawIngest {
                 packets.accept(&header);
                 if let Some((auditor, record)) = recording {
                     let log_sequence = carried_out.sequence;
-                    auditor.send(Record { log_sequence, ..record }, Some(permit));
+                    auditor.send(Record { log_sequence, ..record }, permit);
                 }
             }
             let _ = done.send(outcome);
@@ -710,7 +710,12 @@ impl RawIngest {
     ) {
         if let Some(auditor) = &context.auditor {
             let record = self.record(context, peer, packet, outcome.as_ref().err().copied());
-            auditor.send(record, outcome.ok());
+            match outcome {
+                Ok(permit) => auditor.send(record, permit),
+                // It may still be carried out.
+                Err(Refusal::NotConfirmed) => auditor.send(record, Permit::default()),
+                Err(_) => auditor.refuse(record),
+            }
         }
     }
 
@@ -724,7 +729,7 @@ impl RawIngest {
         let (format, payload) = (self.format, payload.to_vec());
         let write = Written::Packet { format, header, payload, refused };
         let (listener, peer) = (Arc::clone(&context.name), Some(peer.clone()));
-        Record { listener, peer, write, log_sequence: None }
+        Record { listener, peer, write, log_sequence: None, refusals: 0 }
     }
 }
 

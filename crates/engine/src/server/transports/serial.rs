@@ -307,8 +307,8 @@ impl ModbusSerial {
         let rights = self.rights.get();
         if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
             let asker = Asker { source: self.source, peer: None };
-            let asked = Asked::send(context, place, (0, unit_id, request), |permitted| {
-                self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
+            let asked = Asked::send(context, place, (0, unit_id, request), |permit| {
+                self.unit_server.forward(&rights, place, &asker, unit_id, request, permit)
             });
             let (asked, answered, refused) = asked;
             context.note_refused(refused, &self.reported, None);

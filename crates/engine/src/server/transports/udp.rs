@@ -194,11 +194,11 @@ impl ModbusUdp {
         };
         if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
             let asker = later.asker(peer.ip());
-            let asked = Asked::send(context, place, (tag, unit_id, request), |permitted| {
+            let asked = Asked::send(context, place, (tag, unit_id, request), |permit| {
                 if later.is_full(peer.ip()) {
                     return Err(ExceptionCode::ServerDeviceBusy);
                 }
-                self.unit_server.forward(&rights, place, &asker, unit_id, request, permitted)
+                self.unit_server.forward(&rights, place, &asker, unit_id, request, permit)
             });
             let (asked, reply, refused) = asked;
             context.note_refused(refused, &Reported::default(), Some(&peer.into()));
