@@ -160,6 +160,71 @@ def test_what_the_log_itself_reports_is_counted(log: Path) -> None:
     assert "gap: 17 lines could not be written" in asked(log).stdout
 
 
+def torn(log: Path, cut: int, *, named: bool = True) -> list[bytes]:
+    """The lines of a log whose line 10 was torn, and continued after a start."""
+    log.write_bytes(log.read_bytes()[:-cut])
+    audit = Audit(log, max_bytes=65536, keep=1)
+    audit.write(event="start")
+    audit.close()
+    lines = log.read_bytes().splitlines(keepends=True)
+    if not named:  # As earlier versions did.
+        fields = json.loads(lines[10])
+        del fields["after"]
+        lines[10] = json.dumps(fields, separators=(",", ":")).encode() + b"\n"
+        start = json.loads(lines[11]) | {"prev": digest_of(lines[10])}
+        lines[11] = json.dumps(start, separators=(",", ":")).encode() + b"\n"
+        log.write_bytes(b"".join(lines))
+    assert (verify([log]).error, verify([log]).breaks) == (None, {"torn": 1})
+    return lines
+
+
+@pytest.mark.parametrize(
+    ("cut", "named"), [(1, True), (1, False), (10, True), (10, False), (80, True)]
+)
+def test_lines_before_a_torn_one_are_tied_to_those_after_it(
+    log: Path, cut: int, named: bool
+) -> None:
+    lines = torn(log, cut, named=named)
+    log.write_bytes(b"".join(changed(lines, 8, forged)))
+    assert verify([log]).error == f"{log}:9: changed"
+    log.write_bytes(b"".join([*lines[:7], *lines[9:]]))
+    assert verify([log]).error is not None
+
+
+def test_a_line_of_earlier_versions_that_was_torn_early_ties_only_by_number(log: Path) -> None:
+    lines = torn(log, 80, named=False)
+    log.write_bytes(b"".join(changed(lines, 8, forged)))
+    assert verify([log]).error is None
+    log.write_bytes(b"".join([*lines[:7], *lines[9:]]))
+    error = f"{log}:9: deleted or moved before this line: seq is 11, after 7"
+    assert verify([log]).error == error
+
+
+@pytest.mark.parametrize("has_whole", [True, False])
+def test_copies_may_have_the_torn_line_whole_or_lack_it(log: Path, has_whole: bool) -> None:
+    last = log.read_bytes().splitlines(keepends=True)[-1]
+    lines = torn(log, 10)
+    copies = [*lines[:9], *([last] if has_whole else []), *lines[10:]]
+    log.write_bytes(b"".join(copies))
+    assert verify([log]).error is None
+    log.write_bytes(b"".join(changed(copies, 8, forged)))
+    assert verify([log]).error == f"{log}:{10 if has_whole else 9}: changed"
+
+
+def test_a_file_that_begins_with_a_torn_line_is_tied_to_the_one_before(log: Path) -> None:
+    before = log.rename(log.with_name("audit.log.1"))
+    audit = Audit(log, max_bytes=65536, keep=1)
+    audit.close()
+    log.write_bytes(b'{"time":"2026-')
+    audit = Audit(log, max_bytes=65536, keep=1)
+    audit.write(event="start")
+    audit.close()
+    assert (verify([before, log]).error, verify([log]).error) == (None, None)
+    whole = before.read_bytes()
+    before.write_bytes(whole.replace(b'"number":10', b'"number":11'))
+    assert verify([log, before]).error == f"{before}:10: changed"
+
+
 def test_an_incomplete_last_line_is_a_gap(log: Path) -> None:
     log.write_bytes(log.read_bytes()[:-5])
     assert asked(log).exit_code == 3

@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 BREAK = "chain"
 """The event of a line that says why the chain does not simply go on. Its `reason` is one of:
 `new` (no line before is known), `missing` (the file was missing or empty at the start), `torn` (the
-last line was incomplete), `unchained` (the last line had no place in a chain), `deleted` (the file
-was deleted while it was written), `changed` (something else changed the size of the file)."""
+last line was incomplete; `after` is the digest of the line before that one), `unchained` (the last
+line had no place in a chain), `deleted` (the file was deleted while it was written), `changed`
+(something else changed the size of the file)."""
 
 
 encoded = msgspec.json.Encoder().encode

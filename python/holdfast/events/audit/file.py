@@ -34,8 +34,8 @@ class AuditFile:
 
     def __init__(self, file: Path, *, max_bytes: int, keep: int) -> None:
         self.file = file
-        self.broken: str | None
-        """Why the chain breaks before the next line, if it does."""
+        self.broken: dict[str, str] | None
+        """Why the chain breaks before the next line, as fields of it, if it does."""
         self._max_bytes = max_bytes
         self._rotation = Rotation(file, keep, self._not_rotated)
         self._prefix = b""
@@ -65,11 +65,11 @@ class AuditFile:
             status = None
         if status is not None and _identity(status) == self._identity:
             if self._is_regular and status.st_size != self._size:
-                self.broken, self._size = "changed", status.st_size
+                self.broken, self._size = {"reason": "changed"}, status.st_size
                 self._end_last_line()
             return
         if self._is_regular and self._descriptor != CLOSED and not _links(self._descriptor):
-            self.broken = "deleted"
+            self.broken = {"reason": "deleted"}
         self.close()
         self._open()
         self._end_last_line()
@@ -142,29 +142,36 @@ class AuditFile:
         self._prefix = b""
         self._size += len(data)
 
-    def _found(self) -> tuple[End, str | None]:
+    def _found(self) -> tuple[End, dict[str, str] | None]:
         """The end of the chain in the files, and why it does not simply go on."""
         last = last_lines(self.file) if self._is_regular else []
         if last:
             return self._end_of(last)
-        aside = [self._rotation.numbered(number) for number in (0, 1)]
-        before = next((last_lines(file) for file in aside if file.is_file()), [])
+        before = self._last_aside()
         if not before:
-            return End(), "new"
+            return End(), {"reason": "new"}
         place, digest = place_of(before[-1]), digest_of(before[-1])
-        return End(0 if place is None else place.seq, digest), "missing"
+        return End(0 if place is None else place.seq, digest), {"reason": "missing"}
 
-    def _end_of(self, last: list[bytes]) -> tuple[End, str | None]:
+    def _end_of(self, last: list[bytes]) -> tuple[End, dict[str, str] | None]:
         *others, line = last
         if not line.endswith(b"\n"):
             self._end_last_line()
-            place = place_of(others[-1]) if others else None
+            before = others or self._last_aside()
+            place = place_of(before[-1]) if before else None
             seq = 0 if place is None else place.seq + 1
-            return End(seq, digest_of(line + b"\n")), "torn"
+            # The torn line may lack its `prev`, which tied it to the lines before.
+            after = {"after": digest_of(before[-1])} if before else {}
+            return End(seq, digest_of(line + b"\n")), {"reason": "torn", **after}
         place = place_of(line)
         if place is None:
-            return End(0, digest_of(line)), "unchained"
+            return End(0, digest_of(line)), {"reason": "unchained"}
         return End(place.seq, digest_of(line)), None
+
+    def _last_aside(self) -> list[bytes]:
+        """The last lines of the file that was put aside last."""
+        aside = [self._rotation.numbered(number) for number in (0, 1)]
+        return next((last_lines(file) for file in aside if file.is_file()), [])
 
     def _end_last_line(self) -> None:
         """Ends an incomplete last line with the next line that is written."""

@@ -214,7 +214,7 @@ class Audit:
                 self._fail()
                 return 0
             if self._file.broken is not None:
-                reports.append({"event": BREAK, "reason": self._file.broken})
+                reports.append({"event": BREAK, **self._file.broken})
         # Without a line to write, nothing shows whether the file can be written again.
         is_probe = self._failing and not records and not self._waiting
         if self._missing or is_probe:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import itertools
+import re
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import partial
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 
 RECORD_START = b'{"time":"'
+PREV = re.compile(rb'{"time":"[^"]*","seq":[0-9]+,"prev":"([0-9a-f]{64})"')
+"""The beginning of a line with the digest of the line before."""
 GZIP_START = b"\x1f\x8b"
 
 
@@ -153,6 +156,8 @@ def _error(
     if before is None:
         findings.first = line.place.prev
         return None
+    if line.says("torn"):
+        return _torn(before_that, before, line, line.place)
     if line.place.broken is not None:
         return None
     if line.place.prev == before.digest:
@@ -163,6 +168,31 @@ def _error(
     if before_that is not None and line.place.prev == before_that.digest:
         return f"{before}: inserted"
     return _broken(findings.files, before, line, after)
+
+
+def _torn(whole: Line | None, torn: Line, line: Line, place: Place) -> str | None:
+    """What is wrong with the lines before one that reports a torn line.
+
+    It names the torn line, and in `after` the whole one before that. In logs of earlier versions,
+    only the torn line names that one, if it is long enough. Copies have the torn line whole, or
+    lack it.
+    """
+    after = place.fields.get("after")
+    last = whole if torn.place is None else torn
+    if last is None:
+        return None
+    expected = (last.seq + 2,) if last is whole else (last.seq + 1, last.seq + 2)
+    # Earlier versions begin anew if the torn line is the only one of its file.
+    begins = place.seq == 1 and after is None
+    if last.place is not None and place.seq not in expected and not begins:
+        return f"{line}: deleted or moved before this line: seq is {place.seq}, after {last.seq}"
+    if after is not None:
+        is_first = whole is None and place.seq == last.seq + 1
+        known = [each.digest for each in (whole, torn) if each is not None]
+        return None if is_first or after in known else f"{last}: changed"
+    named = PREV.match(torn.data) if place.prev == torn.digest else None
+    is_tied = named is None or whole is None or named[1].decode() == whole.digest
+    return None if is_tied else f"{whole}: changed"
 
 
 def _foreign(before: Line | None, line: Line, after: Line | None) -> str | None:
@@ -234,7 +264,8 @@ def _in_order(files: Iterable[Path]) -> list[Path]:
     ends: dict[str, Path] = {}
     begins: dict[Path, tuple[str, str | None]] = {}
     for file in dict.fromkeys(files):
-        place = next((line.place for line in _lines([file])), None)
+        # The first line may be torn.
+        place = next((line.place for line in _lines([file]) if line.place is not None), None)
         last = last_lines(file)
         time = "" if place is None else str(place.fields.get("time", ""))
         begins[file] = (time, None if place is None else place.prev)
