@@ -10,6 +10,7 @@ import threading
 from hashlib import sha256
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 
 from holdfast.events import log_lines as logs
@@ -351,3 +352,27 @@ def test_a_torn_line_is_ended_also_when_the_disk_was_full_first(
     audit.close()
     findings = verify([log])
     assert (findings.error, findings.breaks, findings.lost) == (None, {"torn": 1}, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "written"),
+    [
+        ("plain \u00e4\u20ac", "plain \u00e4\u20ac"),
+        ("\x7f\x9b", "\\u007f\\u009b"),
+        ("a\u202eb\u200b\u2028", "a\\u202eb\\u200b\\u2028"),
+        ("\U000e0001", "\\udb40\\udc01"),
+    ],
+    ids=["visible", "control", "format", "tag"],
+)
+def test_invisible_characters_are_escaped(log: Path, text: str, written: str) -> None:
+    audit = opened(log)
+    audit.write(subject=text)
+    audit.write_group(
+        audit.queue([msgspec.Raw(json.dumps({"source": text}, ensure_ascii=False).encode())])
+    )
+    audit.close()
+    *_, subject, source = log.read_text(encoding="utf-8").splitlines()
+    assert subject.endswith(f'"subject":"{written}"}}')
+    assert source.endswith(f'"source": "{written}"}}')
+    assert json.loads(subject)["subject"] == json.loads(source)["source"] == text
+    assert verify([log]).error is None
