@@ -311,7 +311,19 @@ def test_lists_are_bounded(gateway: Running) -> None:
     assert answer.json["error"] == "tags: found 2001 tags, allowed: up to 2000"
     long = csv([f"t{at},hr,0,uint16[200]" for at in range(101)])
     answer = local(gateway, "/tags", {"tags": long, "format": "csv"})
-    assert answer.json["error"] == "tags: found 20200 bits and registers, allowed: up to 20000"
+    assert answer.json["error"] == (
+        "tags: found 20200 bits, registers and states, allowed: up to 20000"
+    )
+
+
+def test_aliases_do_not_multiply_what_a_list_takes(gateway: Running) -> None:
+    states = ", ".join(f"{value}: s{value}" for value in range(1500))
+    tags = [f"t{at}: {{area: holding_registers, address: {at}, states: *s}}" for at in range(1, 20)]
+    first = f"t0: {{area: holding_registers, address: 0, states: &s {{{states}}}}}"
+    text = "tags:\n  " + "\n  ".join([first, *tags])
+    answer = local(gateway, "/tags", {"tags": text})
+    assert answer.status == 400
+    assert "values with aliases expanded, allowed: up to 20000" in answer.json["error"]
 
 
 @pytest.mark.parametrize(

@@ -53,9 +53,14 @@ def load_tags(path: Path | str) -> TagList:
     return load_profile(Path(path), str(path)).tag_list
 
 
-def parse_tags(text: str, file: str, *, is_csv: bool) -> TagList:
-    """Parses a tag list; messages call it `file`. Raises `ConfigError` with every problem."""
-    return _profile(text, file, "tags", Path(), is_csv=is_csv).tag_list
+def parse_tags(
+    text: str, file: str, *, is_csv: bool, max_values: int = yaml_document.MAX_VALUES
+) -> TagList:
+    """Parses a tag list; messages call it `file`. Raises `ConfigError` with every problem.
+
+    YAML may have `max_values` values, with aliases expanded.
+    """
+    return _profile(text, file, "tags", Path(), is_csv=is_csv, max_values=max_values).tag_list
 
 
 def load_profile(path: Path, file: str) -> ProfileConfig:
@@ -65,11 +70,19 @@ def load_profile(path: Path, file: str) -> ProfileConfig:
     return _profile(text, file, name, path.parent, is_csv=path.suffix.lower() == ".csv")
 
 
-def _profile(text: str, file: str, name: str, folder: Path, *, is_csv: bool) -> ProfileConfig:
+def _profile(
+    text: str,
+    file: str,
+    name: str,
+    folder: Path,
+    *,
+    is_csv: bool,
+    max_values: int = yaml_document.MAX_VALUES,
+) -> ProfileConfig:
     if is_csv:
         document, problems = _csv(text, file)
     else:
-        document, problems = yaml_document.parse(text, file)
+        document, problems = yaml_document.parse(text, file, max_values=max_values)
     if not isinstance(document.data, dict):
         message = f"found {show(document.data)}, allowed: a mapping with the keys order, tags"
         raise ConfigError(file, problems or [Problem(file, 1, 1, "", message)])

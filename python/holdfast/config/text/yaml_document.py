@@ -182,12 +182,18 @@ def read_bytes(path: Path, file: str, max_bytes: int = MAX_BYTES) -> bytes:
 
 
 def parse(
-    text: str, file: str, resolve: Resolve | None = None, *, merges: bool = False
+    text: str,
+    file: str,
+    resolve: Resolve | None = None,
+    *,
+    merges: bool = False,
+    max_values: int = MAX_VALUES,
 ) -> tuple[Document, list[Problem]]:
     """Returns the document and its problems. Raises `ConfigError` if the YAML is not valid.
 
     For files of other programs: `resolve` gives scalars with a tag of their own a value, which must
     be a scalar. With `merges`, the key `<<` adds the keys of other mappings that are not there.
+    `max_values` counts values with aliases expanded.
     """
     if found := _NOT_ALLOWED.search(text):
         line = text[: found.start()].count("\n") + 1
@@ -201,8 +207,8 @@ def parse(
     except RecursionError:
         raise _error(file, "not a configuration: nested too deeply") from None
     data, spot = reader.document
-    if spot.values > MAX_VALUES:
-        message = f"found {spot.values} values with aliases expanded, allowed: up to {MAX_VALUES}"
+    if spot.values > max_values:
+        message = f"found {spot.values} values with aliases expanded, allowed: up to {max_values}"
         raise ConfigError(file, [Problem(file, 1, 1, "", message)])
     document = Document(file, data, spot)
     return document, [

@@ -26,12 +26,15 @@ if TYPE_CHECKING:
 MAX_TAGS = 2000
 """The most tags of one list."""
 MAX_ITEMS = 20_000
-"""The most bits and registers of the tags of one list."""
+"""The most bits, registers and states of the tags of one list."""
+MAX_VALUES = 20_000
+"""The most values of a list in YAML, with aliases expanded: each tag copies what an alias names."""
 MAX_PROBLEMS = 10
 """The most problems of a tag list that an answer names."""
 MAX_TEXT = 65536
-MAX_PARSED = 32
-"""Parsed lists that are kept, because clients send their list with each request."""
+MAX_PARSED = 16
+"""Parsed lists that are kept, because clients send their list with each request. Each takes up to
+2 MB."""
 
 TEXT = Field(
     "tags",
@@ -78,16 +81,17 @@ async def tags_of(given: Given, profiles: Mapping[str, TagList]) -> TagList:
 @lru_cache(MAX_PARSED)
 def _parsed(text: str, is_csv: bool) -> TagList:
     try:
-        tags = parse_tags(text, "tags", is_csv=is_csv)
+        tags = parse_tags(text, "tags", is_csv=is_csv, max_values=MAX_VALUES)
     except ConfigError as error:
         problems = [str(each) for each in error.problems[:MAX_PROBLEMS]]
         more = len(error.problems) - len(problems)
         raise malformed("\n".join([*problems, *([f"and {more} more"] if more else [])])) from None
     if len(tags) > MAX_TAGS:
         raise malformed(f"tags: found {len(tags)} tags, allowed: up to {MAX_TAGS}")
-    items = sum(tag.count for tag in tags)
+    items = sum(tag.count + len(tag.states) for tag in tags)
     if items > MAX_ITEMS:
-        raise malformed(f"tags: found {items} bits and registers, allowed: up to {MAX_ITEMS}")
+        found = f"{items} bits, registers and states"
+        raise malformed(f"tags: found {found}, allowed: up to {MAX_ITEMS}")
     return tags
 
 
