@@ -282,6 +282,20 @@ def test_roles_are_checked(pki: Pki, role: str) -> None:
     assert not (pki / "panel.key").exists()
 
 
+@pytest.mark.parametrize("option", ["--common-name", "--role"])
+def test_bytes_that_are_not_text_are_refused(pki: Pki, option: str) -> None:
+    told = pki.refuses("client", "panel", option, "a\udc9b")
+    what = option.removeprefix("--common-")
+    assert told.endswith(f"{what.strip('-')} that is not text in UTF-8: 'a\\udc9b'")
+    assert not (pki / "panel.key").exists()
+
+
+def test_names_in_certificates_can_not_forge_lines(pki: Pki) -> None:
+    pki.does("client", "panel", "--common-name", "a\x1b[8m\n  role  operator\u202e")
+    shown = pki.tries("show", str(pki / "panel.pem")).stdout
+    assert "CN=a\\x1b[8m\\x0a  role  operator\\u202e\n" in shown
+
+
 def test_files_of_the_authority_are_checked(plant: Pki) -> None:
     wrong_key = plant.refuses("client", "new", "--ca-key", str(plant / "plc.key"))
     assert "plc.key: it is not the key of the certificate in " in wrong_key

@@ -25,7 +25,7 @@ from holdfast.cli.options.option import (
     option,
     option_group,
 )
-from holdfast.cli.terminal_text import print_json
+from holdfast.cli.terminal_text import plain, print_json
 from holdfast.net.certificates import authority as making
 from holdfast.net.certificates import files as pem_files
 from holdfast.net.certificates import inspection
@@ -330,8 +330,8 @@ def _as_text(described: Sequence[Described]) -> str:
         width = max(map(len, labels.values()))
         lines = [each.kind]
         lines += [f"  {labels[key]:{width}}  {_shown(key, shown[key])}" for key in shown]
-        lines += [f"  fails: {flaw}" for flaw in each.flaws]
-        lines += [f"  note: {text}" for text in each.advice]
+        lines += [f"  fails: {plain(flaw)}" for flaw in each.flaws]
+        lines += [f"  note: {plain(text)}" for text in each.advice]
         parts.append("\n".join(lines))
     return "\n\n".join(parts)
 
@@ -344,8 +344,8 @@ def _shown(key: str, value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list):
-        return ", ".join(map(str, value))
-    return "none" if value is None else str(value)
+        return plain(", ".join(map(str, value)))
+    return "none" if value is None else plain(str(value))
 
 
 def _revoked(entry: dict[str, str]) -> str:

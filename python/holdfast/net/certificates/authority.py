@@ -250,16 +250,25 @@ def _signing_key(authority: x509.Certificate) -> _SigningKey:
 
 def role_der(role: str) -> bytes:
     """Returns a role as the value of its extension, a UTF8String. Raises `Refused`."""
-    text = role.encode()
+    text = _utf8(role, "role")
     if not text or len(text) > MAX_ROLE:
         raise Refused(f"found a role of {len(text)} bytes, allowed: 1 to {MAX_ROLE}")
     length = bytes([len(text)]) if len(text) < 0x80 else bytes([0x81, len(text)])
     return bytes([UTF8_STRING]) + length + text
 
 
+def _utf8(text: str, what: str) -> bytes:
+    """A text of a command line as UTF-8. Raises `Refused`."""
+    try:
+        return text.encode()
+    except UnicodeEncodeError:
+        raise Refused(f"found a {what} that is not text in UTF-8: {text!r}") from None
+
+
 def _subject(name: str) -> x509.Name:
     if not 0 < len(name) <= MAX_NAME:
         raise Refused(f"found a name of {len(name)} characters, allowed: 1 to {MAX_NAME}")
+    _utf8(name, "name")
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
 
 
