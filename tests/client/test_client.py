@@ -785,6 +785,23 @@ def test_a_url_that_names_no_device_is_refused(url: str, text: str) -> None:
         holdfast.SyncClient(url)
 
 
+@pytest.mark.parametrize(
+    "url",
+    [
+        "tcp://me:secret@plc:502",
+        "tcp://me:sec/secret@plc:502",
+        "http://me:secret@plc:502",
+        "tcp://plc:502?token=secret",
+        "tcp://plc:502?retries=x&token=secret",
+        "tcp://plc:502#secret",
+    ],
+)
+def test_what_may_be_a_secret_in_a_url_is_not_shown(url: str) -> None:
+    with pytest.raises(ValueError, match=f"^'{url[: url.index(':')]}://plc:502'") as caught:
+        holdfast.SyncClient(url)
+    assert "secret" not in str(caught.value)
+
+
 def test_a_url_is_a_text() -> None:
     with pytest.raises(TypeError, match="5 is not the URL of a device"):
         holdfast.Client(5)  # type: ignore[arg-type]

@@ -158,13 +158,13 @@ def parse(url: str) -> Target:
     try:
         parts = urlsplit(_clean(url))
     except ValueError as error:
-        raise ValueError(f"{url!r}: {error}, allowed: {FORMS}") from None
+        raise ValueError(f"{_shown(url)}: {error}, allowed: {FORMS}") from None
     scheme = parts.scheme
     if parts.fragment or parts.username is not None:
-        raise ValueError(f"{url!r} has a user or a fragment, allowed: {FORMS}")
+        raise ValueError(f"{_shown(url)} has a user or a fragment, allowed: {FORMS}")
     if scheme in TRANSPORTS:
         if not parts.netloc or parts.path not in ("", "/"):
-            raise ValueError(f"{url!r} is not the address of a device, allowed: {FORMS}")
+            raise ValueError(f"{_shown(url)} is not the address of a device, allowed: {FORMS}")
         host, port = _location(url, parts.netloc)
         port = usual_port(scheme) if port is None else port
         options = options_of(url, scheme, parts.query)
@@ -177,7 +177,12 @@ def parse(url: str) -> Target:
     if scheme in ("rtu", "ascii"):
         return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
     near = suggestion(scheme, (*TRANSPORTS, *SERIAL)) if scheme else ""
-    raise ValueError(f"{url!r} is not the URL of a device, allowed: {FORMS}{near}")
+    raise ValueError(f"{_shown(url)} is not the URL of a device, allowed: {FORMS}{near}")
+
+
+def _shown(url: str) -> str:
+    """A URL for messages, without its user, options and fragment, which may be secrets."""
+    return repr(re.split("[?#]", re.sub("//.*@", "//", url, flags=re.DOTALL), maxsplit=1)[0])
 
 
 def _clean(url: str) -> str:
@@ -193,7 +198,7 @@ def _location(url: str, netloc: str) -> tuple[str, int | None]:
         return host_and_port(netloc)
     except ValueError as error:
         hint = "; options begin with '?'" if re.search("[&;,=]", netloc) else ""
-        raise ValueError(f"{url!r}: {error}{hint}") from None
+        raise ValueError(f"{_shown(url)}: {error}{hint}") from None
 
 
 def in_folder(url: str, folder: Path) -> str:
@@ -321,13 +326,15 @@ def options_of(url: str, scheme: str, query: str) -> dict[str, Any]:
         if option is None or scheme not in option.schemes:
             known = [name for name, each in OPTIONS.items() if scheme in each.schemes]
             words = f"{listing(known)}{suggestion(key, known)}"
-            raise ValueError(f"{url!r}: unknown option {key!r}, allowed: {words}")
+            raise ValueError(f"{_shown(url)}: unknown option {key!r}, allowed: {words}")
         if key in options:
-            raise ValueError(f"{url!r}: option {key!r} is given twice")
+            raise ValueError(f"{_shown(url)}: option {key!r} is given twice")
         try:
             options[key] = option.read(text)
         except ValueError:
-            raise ValueError(f"{url!r}: {key} is {text!r}, allowed: {option.allowed}") from None
+            raise ValueError(
+                f"{_shown(url)}: {key} is {text!r}, allowed: {option.allowed}"
+            ) from None
     return options
 
 
@@ -336,11 +343,12 @@ def _serial(url: str, mode: Mode, path: str, query: str) -> SerialTarget:
     if port := re.fullmatch(r"/?((?i:COM)[0-9]+|\\\\\.\\.+)", device):
         device = port[1]  # Ports of Windows have no leading slash.
     if device in ("", "/"):
-        raise ValueError(f"{url!r} has no device, allowed: {FORMS}")
+        raise ValueError(f"{_shown(url)} has no device, allowed: {FORMS}")
     if not port and not device.startswith("/"):
         raise ValueError(
-            f"{url!r} is not a serial line, allowed: three slashes, as in {mode}:///dev/ttyUSB0, "
-            f"or {mode}://COM3; {mode.upper()} frames over TCP are {mode}+tcp://host:502"
+            f"{_shown(url)} is not a serial line, allowed: three slashes, as in "
+            f"{mode}:///dev/ttyUSB0, or {mode}://COM3; {mode.upper()} frames over TCP are "
+            f"{mode}+tcp://host:502"
         )
     options = options_of(url, mode, query)
     if mode == "rtu" and options.get("data_bits", 8) != 8:
@@ -373,7 +381,7 @@ class Receiver:
 
 def parse_receiver(url: str) -> Receiver:
     """Parses `raw://host:port` and `raw+tls://host:port`. Raises `ValueError` for anything else."""
-    wrong = f"found {url!r}, allowed: {RECEIVER_FORM}"
+    wrong = f"found {_shown(url)}, allowed: {RECEIVER_FORM}"
     try:
         parts = urlsplit(_clean(url))
     except ValueError:
