@@ -663,6 +663,19 @@ def test_what_a_client_cannot_be_is_refused(
         make("tcp://127.0.0.1", **options)
 
 
+@pytest.mark.parametrize("face", FACES.values(), ids=FACES)
+def test_settings_of_a_client_are_checked_when_they_change(face: Any) -> None:
+    make = holdfast.Client if face is Awaited else face
+    client = make("tcp://127.0.0.1", unit=3, timeout=2)
+    with pytest.raises(ValueError, match="unit is 300, allowed: 0 to 255"):
+        client.unit = 300
+    with pytest.raises(ValueError, match="timeout is -1, allowed: more than 0"):
+        client.timeout = -1
+    with pytest.raises(TypeError, match="timeout is '3', allowed: more than 0"):
+        client.timeout = "3"
+    assert (client.unit, client.timeout) == (3, 2)
+
+
 @pytest.mark.parametrize("number", [0, 1025, 1.0, True, None])
 def test_the_number_in_flight_has_its_limits(number: Any) -> None:
     with pytest.raises(ValueError, match="allowed: 1 to 1024"):

@@ -289,10 +289,10 @@ class AsyncOperations(BaseClient):
         """Runs a plan."""
         if isinstance(plan, Request):
             result: Awaitable[Result] = self._transport.call(
-                plan, self.unit_for(plan, unit), self.timeout
+                plan, self.unit_for(plan, unit), self._timeout
             )
             return result
         return requests.carry_out_async(plan, lambda request: self._call(request, unit))
 
     def _call(self, request: Request, unit: int | None) -> Awaitable[Any]:
-        return self._transport.call(request, self.unit_for(request, unit), self.timeout)
+        return self._transport.call(request, self.unit_for(request, unit), self._timeout)

@@ -21,6 +21,9 @@ DEFAULT_TIMEOUT_S = 1.0
 
 MAX_TIMEOUT_S = 86_400.0
 
+MIN_INTERVAL_S, MAX_INTERVAL_S = 0.01, 31_622_400
+"""Seconds between polls of a device."""
+
 BROADCAST = "unit 0 of a serial line is the broadcast"
 
 
@@ -29,12 +32,30 @@ class BaseClient:
 
     def __init__(self, url: str, unit: int, timeout: float) -> None:
         self.target = parse(url)
-        self.unit = _unit(unit)
-        self.timeout = _timeout(timeout)
+        self.unit = unit
+        self.timeout = timeout
+
+    @property
+    def unit(self) -> int:
+        """The unit id of calls that name none."""
+        return self._unit
+
+    @unit.setter
+    def unit(self, unit: int) -> None:
+        self._unit = checked_unit(unit)
+
+    @property
+    def timeout(self) -> float:
+        """Seconds for a request and its reply."""
+        return self._timeout
+
+    @timeout.setter
+    def timeout(self, seconds: float) -> None:
+        self._timeout = checked_seconds("timeout", seconds, MAX_TIMEOUT_S)
 
     def unit_for(self, request: Request, unit: int | None) -> int:
         """The unit id of a call. Raises `ValueError` for a function that can't be broadcast."""
-        unit = self.unit if unit is None else _unit(unit)
+        unit = self._unit if unit is None else checked_unit(unit)
         if is_broadcast(self.target, unit):
             code = request.pdu[0]
             if code not in BROADCAST_CODES:
@@ -47,10 +68,12 @@ def is_broadcast(target: Target, unit: int) -> bool:
     return unit == 0 and isinstance(target, SerialTarget)
 
 
-def _timeout(seconds: float) -> float:
-    refusal = f"timeout is {seconds!r}, allowed: more than 0, up to 86400 seconds"
+def checked_seconds(name: str, seconds: float, most: float, least: float | None = None) -> float:
+    """The seconds as a float: from `least`, or more than 0, up to `most`."""
+    lower = "more than 0, up" if least is None else f"{least}"
+    refusal = f"{name} is {seconds!r}, allowed: {lower} to {most:.0f} seconds"
     try:
-        is_allowed = 0 < seconds <= MAX_TIMEOUT_S
+        is_allowed = 0 < seconds <= most and (least is None or least <= seconds)
     except TypeError:
         raise TypeError(refusal) from None
     if not is_allowed:
@@ -58,7 +81,8 @@ def _timeout(seconds: float) -> float:
     return float(seconds)
 
 
-def _unit(unit: int) -> int:
+def checked_unit(unit: int) -> int:
+    """The unit id as an integer: 0 to 255."""
     number = as_integer(unit)
     if number is None or not 0 <= number <= MAX_UNIT:
         raise ValueError(f"unit is {unit!r}, allowed: 0 to {MAX_UNIT}")

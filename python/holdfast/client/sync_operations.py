@@ -282,9 +282,9 @@ class SyncOperations(BaseClient):
     def _run(self, plan: Plan[Result], unit: int | None) -> Result:
         """Runs a plan."""
         if isinstance(plan, Request):
-            result: Result = self._transport.call(plan, self.unit_for(plan, unit), self.timeout)
+            result: Result = self._transport.call(plan, self.unit_for(plan, unit), self._timeout)
             return result
         return requests.carry_out(plan, lambda request: self._call(request, unit))
 
     def _call(self, request: Request, unit: int | None) -> Any:
-        return self._transport.call(request, self.unit_for(request, unit), self.timeout)
+        return self._transport.call(request, self.unit_for(request, unit), self._timeout)

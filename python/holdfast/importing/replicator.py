@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.models.devices import LAST_SLOT, MIN_INTERVAL
+from holdfast.client.base import MIN_INTERVAL_S
+from holdfast.config.models.devices import LAST_SLOT
 from holdfast.config.text.messages import show
 from holdfast.importing.imported import Imported, Source
 from holdfast.importing.key_reader import Section, seconds, section
@@ -124,10 +125,10 @@ class _Units:
         """Seconds between polls."""
         given = poll.integer("interval_ms", 1, MAX_MS, required=True, what="milliseconds")
         poll.close()
-        if given is not None and given < MIN_INTERVAL * 1000:
-            message = f"raised to {MIN_INTERVAL * 1000:g} ms, the shortest interval"
+        if given is not None and given < MIN_INTERVAL_S * 1000:
+            message = f"raised to {MIN_INTERVAL_S * 1000:g} ms, the shortest interval"
             self.desk.changed(poll.at("interval_ms"), message)
-            return MIN_INTERVAL
+            return MIN_INTERVAL_S
         return None if given is None else seconds(given)
 
     def _timeout(self, source: Section) -> float | None:

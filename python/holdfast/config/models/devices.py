@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationInfo, model_validator
 
 from holdfast._core import MAX_IN_FLIGHT, RETRY_PAUSES_S
-from holdfast.client.base import DEFAULT_TIMEOUT_S
+from holdfast.client.base import DEFAULT_TIMEOUT_S, MAX_INTERVAL_S, MIN_INTERVAL_S
 from holdfast.client.url import (
     MAX_CLOSE_AFTER,
     MAX_PAUSE_S,
@@ -24,7 +24,6 @@ from holdfast.config.models.base import Model, problem_at
 from holdfast.config.models.memories import Register, Size
 from holdfast.config.models.tags import TagConfig
 from holdfast.config.values.scalars import (
-    MAX_TIME,
     NAME_KEYS,
     DeviceUrl,
     Duration,
@@ -44,7 +43,6 @@ from holdfast.types import WRITABLE_AREAS, Area, RegisterArea
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-MIN_INTERVAL = 0.01
 TAKING_TIME = ("reads", "profile", "tags")
 """The keys that make a device polled, so that it needs an interval."""
 STATUS_BLOCK = 30
@@ -200,7 +198,7 @@ class ForwardConfig(Model):
 
 
 InFlight = Annotated[int, Field(ge=1, le=MAX_IN_FLIGHT)] | Literal["auto"]
-Interval = Annotated[float, seconds(MIN_INTERVAL, MAX_TIME), whole_number]
+Interval = Annotated[float, seconds(MIN_INTERVAL_S, MAX_INTERVAL_S), whole_number]
 Pause = Annotated[float, seconds(0, MAX_PAUSE_S), whole_number]
 AcceptUnit = Annotated[Annotated[int, Field(ge=0, le=MAX_UNIT)] | Literal["any"] | None, NotNull()]
 

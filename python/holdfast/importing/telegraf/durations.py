@@ -6,7 +6,7 @@ import re
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
-from holdfast.config.models.devices import MIN_INTERVAL
+from holdfast.client.base import MIN_INTERVAL_S
 from holdfast.config.text.messages import show
 from holdfast.config.values.scalars import MAX_TIME
 
@@ -49,8 +49,8 @@ def seconds(section: Section, key: str) -> float | None:
 def interval(section: Section) -> float | None:
     """The interval of a table in seconds, as long as the shortest here."""
     found = seconds(section, "interval")
-    if found is not None and found < MIN_INTERVAL:
-        message = f"raised to {MIN_INTERVAL * 1000:g} ms, the shortest interval"
+    if found is not None and found < MIN_INTERVAL_S:
+        message = f"raised to {MIN_INTERVAL_S * 1000:g} ms, the shortest interval"
         section.desk.changed(section.at("interval"), message)
-        return MIN_INTERVAL
+        return MIN_INTERVAL_S
     return found
