@@ -269,6 +269,9 @@ def test_a_scale_that_no_request_can_reach_is_told(device: holdfast.Server, poll
         ({"url": "http://a"}, "http"),
         ({"unit": 256}, "unit"),
         ({"interval": -1}, "interval"),
+        ({"interval": 0}, "interval is 0, allowed: 0.01 to 31622400 seconds"),
+        ({"interval": float("nan")}, "interval is nan"),
+        ({"timeout": 0}, "timeout is 0, allowed: more than 0, up to 86400 seconds"),
     ],
 )
 def test_wrong_arguments_are_refused(
@@ -278,6 +281,37 @@ def test_wrong_arguments_are_refused(
     with pytest.raises(ValueError, match=message):
         poller.add(**(settings | arguments))
     assert poller.counters() == {}
+
+
+@pytest.mark.parametrize("interval", ["1", None])
+def test_an_interval_is_a_number(poller: Poller, interval: Any) -> None:
+    with pytest.raises(TypeError, match=f"interval is {interval!r}, allowed: 0.01 to"):
+        poller.add("tcp://127.0.0.1", {"x": ("coils", 1)}, interval=interval)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "message"),
+    [
+        ("tcp://127.0.0.1:1?accept_unit=255", "tcp://127.0.0.1:1", "accept_unit is None, but"),
+        ("tcp://127.0.0.1:1", "tcp://127.0.0.1:1?write_multiple=1", "write_multiple is True, but"),
+        ("rtu:///dev/x", "rtu:///dev/../dev/x?baud=9600", "baud is 9600, but other devices at"),
+        ("rtu:///dev/x?parity=none", "rtu:///dev/x?stop_bits=2", "parity is 'even', but"),
+    ],
+)
+def test_devices_at_one_address_have_equal_options(
+    poller: Poller, first: str, second: str, message: str
+) -> None:
+    tags = {"x": ("coils", 1)}
+    poller.add(first, tags, name="a")
+    poller.add(first, tags, name="b", unit=2)
+    poller.remove("a")
+    with pytest.raises(ValueError, match=message):
+        poller.add(second, tags, name="c")
+    with pytest.raises(ValueError, match=r"in_flight is 2, but .* have 1, allowed: the same"):
+        poller.add(first, tags, name="c", in_flight=2)
+    poller.remove("b")
+    poller.add(second, tags, name="c")
+    assert list(poller.counters()) == ["c"]
 
 
 def test_the_end_ends_the_iteration(device: holdfast.Server) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.client.url import SerialTarget, connection_of
+from holdfast.client.url import shared_connection, shared_options
 from holdfast.config.checks.units import routed
 from holdfast.config.fingerprint import fingerprint
 from holdfast.runtime.bounded_files import answered
@@ -133,17 +133,12 @@ def _deciding_devices(config: Config) -> Iterator[tuple[str, DeviceConfig]]:
 
 
 def _address(user: DeviceConfig | LinkConfig) -> tuple[str, str]:
-    target = user.target
-    # TLS and plain TCP at one address are two connections.
-    transport = "" if isinstance(target, SerialTarget) else target.transport
-    return transport, connection_of(target)
+    return shared_connection(user.target)
 
 
 def _connection_settings(user: DeviceConfig | LinkConfig) -> object:
     """What a connection or line has from its first user."""
-    target = user.target
-    line = target.settings if isinstance(target, SerialTarget) else None
-    return line, target.tolerance, user.in_flight, user.retry
+    return shared_options(user.target), user.in_flight, user.retry
 
 
 def _is_changed(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
@@ -149,6 +150,19 @@ def connection_of(target: Target) -> str:
     host = target.host.lower() if found is None else str(found)
     transport = "tcp" if target.transport == "tls" else target.transport
     return f"{transport}://{joined(host, target.port)}"
+
+
+def shared_connection(target: Target) -> tuple[str, str]:
+    """The connection that polled devices share. TLS and plain TCP at one address are two."""
+    if isinstance(target, SerialTarget):
+        return "", os.path.realpath(target.device)
+    return target.transport, connection_of(target)
+
+
+def shared_options(target: Target) -> dict[str, Any]:
+    """The options of a URL that all devices at a connection or line have from its first user."""
+    line = target.settings if isinstance(target, SerialTarget) else {}
+    return line | asdict(target.tolerance)
 
 
 def parse(url: str) -> Target:

@@ -9,10 +9,18 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
 from holdfast import _core
-from holdfast.client.base import BROADCAST, DEFAULT_TIMEOUT_S, is_broadcast
+from holdfast.client.base import (
+    BROADCAST,
+    DEFAULT_TIMEOUT_S,
+    MAX_INTERVAL_S,
+    MAX_TIMEOUT_S,
+    MIN_INTERVAL_S,
+    checked_seconds,
+    is_broadcast,
+)
 from holdfast.client.endpoint import endpoint
 from holdfast.client.requests import write_typed
-from holdfast.client.url import parse
+from holdfast.client.url import parse, shared_connection, shared_options
 from holdfast.polling.faults import LOST, fault_text
 from holdfast.polling.readings import Batch, Reader
 from holdfast.protocol import READ_BITS, READ_REGISTERS
@@ -69,6 +77,10 @@ class Poller:
         """By the name in the core, see `_core_names`."""
         self._core_names: dict[str, str] = {}
         """A device that is added again has a new one: polls of the earlier device may be queued."""
+        self._places: dict[str, tuple[str, str]] = {}
+        """The connection of each device, by its name in the core."""
+        self._connections: dict[tuple[str, str], tuple[dict[str, object], set[str]]] = {}
+        """The options of each connection, and its devices."""
         self._names = itertools.count(1)
         self._generations = itertools.count(1)
         self._executor: ThreadPoolExecutor | None = None
@@ -97,9 +109,15 @@ class Poller:
         default that of the address, with a number if it is in use. `max_gap` is the largest gap, in
         bits or registers, that is read to save a request.
 
-        Raises `ValueError` for invalid arguments and a name in use, `TagError` for an invalid tag,
-        and `RuntimeError` after `close`.
+        Devices at one address or serial line share a connection, and so `in_flight` and the options
+        of the URL.
+
+        Raises `ValueError` for invalid arguments, a name in use, and options that differ from those
+        of another device at the address; `TypeError` if a time is not a number; `TagError` for an
+        invalid tag, and `RuntimeError` after `close`.
         """
+        interval = checked_seconds("interval", interval, MAX_INTERVAL_S, MIN_INTERVAL_S)
+        timeout = checked_seconds("timeout", timeout, MAX_TIMEOUT_S)
         target = parse(url)
         if is_broadcast(target, unit):
             raise ValueError(f"{BROADCAST}, which can't be polled")
@@ -110,6 +128,13 @@ class Poller:
             name = self._free(url.partition("://")[2] or url)
         if name in self._core_names:
             raise ValueError(f"device {name}: the name is already in use")
+        place = shared_connection(target)
+        options = shared_options(target) | {"in_flight": in_flight}
+        known, users = self._connections.get(place, (options, set()))
+        for option, value in options.items():
+            if value != known[option]:
+                others = f"other devices at this address have {known[option]!r}"
+                raise ValueError(f"{url!r}: {option} is {value!r}, but {others}, allowed: the same")
         core_name = f"{name}#{next(self._generations)}"
         reader = Reader(name, listed)
         self._poller.add(
@@ -129,6 +154,9 @@ class Poller:
                 start_within=min(interval, SIGNAL_CHECK_S * len(self._readers)),
             )
         )
+        users.add(core_name)
+        self._connections[place] = known, users
+        self._places[core_name] = place
         self._readers[core_name] = reader
         self._core_names[name] = core_name
         return name
@@ -140,6 +168,11 @@ class Poller:
         """Stops polling a device. Raises `KeyError` for an unknown name."""
         core_name = self._core_names.pop(name)
         del self._readers[core_name]
+        place = self._places.pop(core_name)
+        _, users = self._connections[place]
+        users.remove(core_name)
+        if not users:
+            del self._connections[place]
         self._poller.remove(core_name)
 
     def write(self, name: str, tag: str, value: Any) -> None:
