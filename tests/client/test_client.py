@@ -810,7 +810,7 @@ def test_a_url_that_names_no_device_is_refused(url: str, text: str) -> None:
     ],
 )
 def test_what_may_be_a_secret_in_a_url_is_not_shown(url: str) -> None:
-    with pytest.raises(ValueError, match=f"^'{url[: url.index(':')]}://plc:502'") as caught:
+    with pytest.raises(ValueError, match=r"^'[a-z]+://([*]{3}@)?plc:502'") as caught:
         holdfast.SyncClient(url)
     assert "secret" not in str(caught.value)
 

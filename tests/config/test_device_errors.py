@@ -201,7 +201,7 @@ def test_a_right_device_is_right(folder: Folder) -> None:
         ("    status", "    forward: [{url: 'raw://a:1/', unit: 1}]\n    status",
          f"13: forward[0].url: found 'raw://a:1/', allowed: {RECEIVER}"),
         ("    status", "    forward: [{url: 'raw://u@a:1', unit: 1}]\n    status",
-         f"13: forward[0].url: found 'raw://u@a:1', allowed: {RECEIVER}"),
+         f"13: forward[0].url: found 'raw://***@a:1', allowed: {RECEIVER}"),
         ("    status", "    forward: [{url: 'raw://a:0', unit: 1}]\n    status",
          "13: forward[0].url: 'raw://a:0': port 0, allowed: 1 to 65535"),
         ("    status", "    forward: [{url: 'raw://a:1'}]\n    status",

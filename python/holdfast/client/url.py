@@ -196,7 +196,7 @@ def parse(url: str) -> Target:
 
 def _shown(url: str) -> str:
     """A URL for messages, without its user, options and fragment, which may be secrets."""
-    return repr(re.split("[?#]", re.sub("//.*@", "//", url, flags=re.DOTALL), maxsplit=1)[0])
+    return repr(re.split("[?#]", re.sub("//.*@", "//***@", url, flags=re.DOTALL), maxsplit=1)[0])
 
 
 def _clean(url: str) -> str:

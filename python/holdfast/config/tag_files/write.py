@@ -8,7 +8,7 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.dump import on_one_line
-from holdfast.config.tag_files.read import COLUMNS
+from holdfast.config.tag_files.read import COLUMNS, MORE_COLUMNS
 from holdfast.tags import Tag
 from holdfast.tags.scale import RegisterScale
 from holdfast.tags.tag import default_type
@@ -33,9 +33,7 @@ def tags_as_yaml(tags: Iterable[Tag]) -> str:
 
 def tags_as_csv(tags: Iterable[Tag]) -> str:
     """Tags as CSV with a line of column names. Names of states go into the description."""
-    out = io.StringIO()
-    rows = csv.DictWriter(out, [*COLUMNS, "null"], lineterminator="\n")
-    rows.writeheader()
+    rows: list[dict[str, Any]] = []
     for tag in tags:
         row = {"name": tag.name, "type": tag.type, **_settings(tag, DEFAULT_ORDER)}
         states = ", ".join(f"{value} {name}" for value, name in row.pop("states", {}).items())
@@ -46,7 +44,12 @@ def tags_as_csv(tags: Iterable[Tag]) -> str:
             row["scale"] = _scale_cell(tag.scale)
         if row.get("writable"):
             row["writable"] = "true"
-        rows.writerow(row)
+        rows.append(row)
+    more = [name for name in MORE_COLUMNS if name == "null" or any(name in row for row in rows)]
+    out = io.StringIO()
+    table = csv.DictWriter(out, [*COLUMNS, *more], lineterminator="\n")
+    table.writeheader()
+    table.writerows(rows)
     return out.getvalue()
 
 
