@@ -116,6 +116,28 @@ def test_a_refused_address_costs_only_its_own_tag(device: holdfast.Server, polle
     wire.until(settled, "only the bad tag is refused")
 
 
+def test_a_refused_tag_does_not_cost_those_that_overlap_it(
+    device: holdfast.Server, poller: Poller
+) -> None:
+    tags = {
+        "inside": ("holding_registers", 5),
+        "partly": ("holding_registers", 4, "uint32"),
+        "bad": ("holding_registers", 5, "uint16[9]"),
+        "last": ("holding_registers", 9),
+    }
+    poller.add(url(device), tags, interval=0.05)
+    batches = iter(poller)
+    for _ in range(3):
+        for poll in next(batches).polls:
+            found = {each.name: (each.value, each.fault) for each in poll.readings}
+            assert found == {
+                "inside": (215, 0),
+                "partly": (8 << 16 | 215, 0),
+                "bad": (None, 2),
+                "last": (0, 0),
+            }
+
+
 def test_nothing_is_polled_from_all_units_of_a_line(poller: Poller) -> None:
     with pytest.raises(ValueError, match="unit 0 of a serial line is the broadcast"):
         poller.add("rtu:///dev/x", {"a": ("coils", 0)}, unit=0)

@@ -113,7 +113,9 @@ class Reader:
         for area, address, count, data, fault, time in blocks:
             tags, decode = self._inside(area, address, count)
             if data is None or decode is None:
-                found.update({tag.name: self._none(tag, time, fault) for tag in tags})
+                for tag in tags:
+                    # A block that overlaps this one may have its value.
+                    found.setdefault(tag.name, self._none(tag, time, fault))
                 continue
             for tag, raw in zip(tags, decode(data), strict=True):
                 found[tag.name] = self._reading(tag, raw, time)

@@ -66,7 +66,7 @@ impl Device {
     }
 }
 
-/// Halves a refused block recursively, until one field is left.
+/// Halves a refused block recursively, until one field, or several equal ones, are left.
 async fn divide(
     device: &Device,
     gathered: &mut Gathered,
@@ -97,10 +97,19 @@ async fn divide(
     Ok(())
 }
 
-/// Finds which neighbours can be read together, and adds cuts between the others.
+/// Finds which neighbours can be read together, and adds cuts between the others. No cut divides
+/// overlapping ones: their block is longer than the device accepts.
 async fn join(device: &Device, refused: &Block, run: &[Part]) -> Result<(), Fault> {
     let Some((first, others)) = run.split_first() else { return Ok(()) };
     let mut whole = first.block.clone();
+    let apart = |joined: &Block, whole: &Block, block: &Block| {
+        let mut learned = device.learned();
+        if joined.count < whole.count + block.count {
+            learned.lower(block.area, whole.count.max(block.count));
+        } else {
+            learned.cut(block.area, block.address.into());
+        }
+    };
     for Part { block, .. } in others {
         let joined = plan::joined(&device.fields, &whole, block);
         let together = (joined.address, joined.count) != (refused.address, refused.count)
@@ -109,14 +118,14 @@ async fn join(device: &Device, refused: &Block, run: &[Part]) -> Result<(), Faul
                 Err(fault) if fault.is_illegal() => false,
                 Err(other) => {
                     // They were answered apart, so they are read apart.
-                    device.learned().cut(block.area, block.address.into());
+                    apart(&joined, &whole, block);
                     return Err(other);
                 }
             };
         if together {
             whole = joined;
         } else {
-            device.learned().cut(block.area, block.address.into());
+            apart(&joined, &whole, block);
             whole = block.clone();
         }
     }

@@ -50,10 +50,9 @@ impl Unreadable {
         (self.area, self.address, self.count) == (other.area, other.address, other.count)
     }
 
-    /// Whether a field is inside the range.
-    fn holds(&self, field: &Field) -> bool {
-        let end = u32::from(field.address) + u32::from(field.count);
-        field.area == self.area && self.address <= field.address && end <= self.end()
+    /// Whether it is the range of this field. A field inside it may be readable.
+    fn is_of(&self, field: &Field) -> bool {
+        *field == Field { area: self.area, address: self.address, count: self.count }
     }
 }
 
@@ -97,7 +96,7 @@ impl Learned {
 
     /// Forgets unreadable ranges without a field. Each leaves a cut at its start.
     pub(super) fn keep(&mut self, fields: &[Field]) {
-        let wanted = |range: &Unreadable| fields.iter().any(|field| range.holds(field));
+        let wanted = |range: &Unreadable| fields.iter().any(|field| range.is_of(field));
         let (kept, unwanted) = std::mem::take(&mut self.unreadable).into_iter().partition(wanted);
         self.unreadable = kept;
         let unwanted: Vec<Unreadable> = unwanted;
@@ -123,7 +122,7 @@ impl Learned {
 
     /// Whether a field is known to be unreadable.
     pub(super) fn is_refused(&self, field: &Field) -> bool {
-        self.unreadable.iter().any(|range| range.holds(field))
+        self.unreadable.iter().any(|range| range.is_of(field))
     }
 
     /// The limits for requests that read these fields. They never make a field unreadable.

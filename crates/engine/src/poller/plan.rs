@@ -316,16 +316,21 @@ fn block(fields: &[Field], order: &[usize]) -> Block {
     Block { area: first.area, address: first.address, count, fields: order.to_vec(), gaps }
 }
 
-/// Splits a refused block in two; `None` for a block of one field.
+/// Splits a refused block in two; `None` for a block of one field, or of equal ones. The halves overlap
+/// if there is no cut between fields.
 pub fn halves(fields: &[Field], refused: &Block) -> Option<[Block; 2]> {
-    // Overlapping fields stay together: only a cut between fields helps.
-    let cut = (1..refused.fields.len())
+    let (first, last) = (refused.fields.first()?, refused.fields.last()?);
+    if fields[*first] == fields[*last] {
+        return None;
+    }
+    let middle = refused.fields.len() / 2;
+    let clean = (1..refused.fields.len())
         .filter(|cut| {
             let (left, right) = refused.fields.split_at(*cut);
             reach(fields, left) <= u32::from(fields[right[0]].address)
         })
-        .min_by_key(|cut| cut.abs_diff(refused.fields.len() / 2))?;
-    let (left, right) = refused.fields.split_at(cut);
+        .min_by_key(|cut| cut.abs_diff(middle));
+    let (left, right) = refused.fields.split_at(clean.unwrap_or(middle));
     Some([block(fields, left), block(fields, right)])
 }
 
@@ -406,6 +411,16 @@ mod tests {
         let [left, right] = halves(&fields, &right).unwrap();
         assert_eq!(spans(&[left.clone(), right]), [(2, 2), (9, 1)]);
         assert_eq!(halves(&fields, &left), None);
+    }
+
+    #[test]
+    fn overlapping_fields_of_a_refused_block_are_read_apart() {
+        let fields = [field(8, 1), field(8, 4), field(10, 4), field(10, 4)];
+        let [left, right] = halves(&fields, &block(&fields, &[0, 1, 2, 3])).unwrap();
+        assert_eq!(spans(&[left.clone(), right.clone()]), [(8, 4), (10, 4)]);
+        let [inner, outer] = halves(&fields, &left).unwrap();
+        assert_eq!(spans(&[inner, outer]), [(8, 1), (8, 4)]);
+        assert_eq!(halves(&fields, &right), None, "equal fields are one");
     }
 
     #[test]

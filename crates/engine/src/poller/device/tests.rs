@@ -296,14 +296,7 @@ fn a_pause_holds_without_an_interval_too() {
 
 /// Settings that read single registers, each on its own.
 fn single_registers(endpoint: Endpoint, addresses: std::ops::Range<u16>) -> DeviceSettings {
-    let reads = addresses.map(|address| ReadSettings {
-        area: AREA,
-        address,
-        count: 1,
-        into: None,
-        forward: true,
-    });
-    DeviceSettings { reads: reads.collect(), ..settings(endpoint, &memory(), 0) }
+    ranges(endpoint, &addresses.map(|address| (address, 1)).collect::<Vec<_>>())
 }
 
 /// The address and the count of each request of a poll.
@@ -347,6 +340,48 @@ fn a_field_that_is_refused_does_not_make_the_other_requests_longer() {
         assert_eq!(planned(&device), [(10, 4), (20, 8)]);
         device.poll(Instant::now()).await;
         assert_eq!(planned(&device), [(20, 2), (22, 2), (24, 2), (26, 2)]);
+    });
+}
+
+/// Settings that read these addresses and counts.
+fn ranges(endpoint: Endpoint, ranges: &[(u16, u32)]) -> DeviceSettings {
+    let reads = ranges.iter().map(|(address, count)| ReadSettings {
+        area: AREA,
+        address: *address,
+        count: *count,
+        into: None,
+        forward: true,
+    });
+    DeviceSettings { reads: reads.collect(), ..settings(endpoint, &memory(), 0) }
+}
+
+#[test]
+fn a_field_that_is_refused_does_not_cost_those_that_overlap_it() {
+    let reply = |address, count| match (address, count) {
+        (address, count) if address + count > 14 => Reply::Exception(2),
+        _ => Reply::Data,
+    };
+    with_replies(reply, async |endpoint| {
+        let settings = ranges(endpoint, &[(10, 2), (11, 8), (12, 1), (13, 2)]);
+        let (device, state, _) = device(settings);
+        assert_eq!(planned(&device), [(10, 9)]);
+        device.poll(Instant::now()).await;
+        assert_eq!((state.counters.reads.get(), state.last_error()), (2, 2));
+        assert_eq!(planned(&device), [(10, 3)]);
+        let before = state.counters.requests.get();
+        device.poll(Instant::now()).await;
+        assert_eq!((state.counters.reads.get(), state.counters.requests.get()), (4, before + 1));
+    });
+}
+
+#[test]
+fn overlapping_fields_that_no_request_reads_together_are_read_apart() {
+    let reply = |_, count| if count > 3 { Reply::Exception(2) } else { Reply::Data };
+    with_replies(reply, async |endpoint| {
+        let (device, state, _) = device(ranges(endpoint, &[(10, 3), (12, 3)]));
+        device.poll(Instant::now()).await;
+        assert_eq!((state.counters.reads.get(), state.health()), (2, Health::Ok));
+        assert_eq!(planned(&device), [(10, 3), (12, 3)]);
     });
 }
 
