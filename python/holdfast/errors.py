@@ -92,15 +92,19 @@ class ConnectionLost(ModbusError, ConnectionError):
 class ConnectFailed(ConnectionLost):
     """Could not connect. Nothing was sent, but for earlier requests of the call.
 
-    `target` is the URL, without options; `detail` is the reason as text.
+    `target` is the URL, without options; `detail` is the reason as text; `errno` is the number of
+    the system's error, or `None`.
     """
 
     maybe_sent = False
 
-    def __init__(self, target: str, detail: str) -> None:
+    def __init__(self, target: str, detail: str, errno: int | None = None) -> None:
         self.target = target
         self.detail = detail
-        super().__init__(target, detail)
+        # Not by the constructor of `OSError`: it takes two arguments for an errno and its text.
+        super().__init__()
+        self.args = target, detail, errno
+        self.errno, self.strerror = errno, detail
 
     def _text(self) -> str:
         return f"can't connect to {self.target}: {self.detail}"
@@ -119,7 +123,9 @@ class TlsFailed(ConnectionLost):
         self.detail = detail
         self.maybe_sent = maybe_sent
         self._was_connected = maybe_sent
-        super().__init__(reason, target, detail, maybe_sent)
+        super().__init__()  # As in `ConnectFailed`.
+        self.args = reason, target, detail, maybe_sent
+        self.strerror = detail
 
     def _text(self) -> str:
         if self._was_connected:

@@ -5,7 +5,9 @@ threads, tasks, event loops, cancellation and closing.
 from __future__ import annotations
 
 import asyncio
+import copy
 import doctest
+import errno
 import gc
 import itertools
 import pickle
@@ -36,6 +38,7 @@ from holdfast.server import Identity
 from holdfast.simulation.device import Refused
 from holdfast.types import AREAS
 from support import lines, transports, wire
+from support.brokers import free_port
 from support.faces import FACES, Awaited, Dial, Face, dialling, run
 from support.fake_device import (
     Asked,
@@ -866,6 +869,7 @@ def test_no_error_of_a_later_request_says_that_nothing_was_written(
         holdfast.ModbusException(2, "illegal data address"),
         holdfast.ConnectionLost("closed"),
         of_a_later_request(holdfast.TlsFailed("expired", "tls://plc", "expired")),
+        holdfast.ConnectFailed("tcp://plc", "Connection refused", errno.ECONNREFUSED),
         WriteFailed("meter", "power", 3),
         TooManyValues(200, 123),
         Refused("power", "power: too large"),
@@ -877,8 +881,21 @@ def test_no_error_of_a_later_request_says_that_nothing_was_written(
     ids=lambda error: type(error).__name__,
 )
 def test_an_error_survives_a_process_pool(error: Exception) -> None:
-    copied = pickle.loads(pickle.dumps(error))
-    assert (type(copied), str(copied), vars(copied)) == (type(error), str(error), vars(error))
+    for copied in (pickle.loads(pickle.dumps(error)), copy.copy(error)):
+        assert (type(copied), str(copied), vars(copied)) == (type(error), str(error), vars(error))
+        if isinstance(error, OSError):
+            assert isinstance(copied, OSError)
+            assert (copied.errno, copied.strerror) == (error.errno, error.strerror)
+
+
+def test_an_error_has_the_number_of_the_system_or_none(dial: Dial) -> None:
+    client = dial(f"tcp://127.0.0.1:{free_port()}")
+    with pytest.raises(holdfast.ConnectFailed) as caught:
+        client.read_coils(0, 1)
+    refused = caught.value
+    assert (refused.errno, refused.strerror) == (errno.ECONNREFUSED, refused.detail)
+    expired = holdfast.TlsFailed("expired", "tls://plc", "it has expired")
+    assert (expired.errno, expired.strerror, expired.filename) == (None, "it has expired", None)
 
 
 # Threads

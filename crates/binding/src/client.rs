@@ -593,7 +593,9 @@ pub(crate) fn raised(error: &ClientError) -> PyErr {
         ClientError::ConnectTimeout { .. } | ClientError::LookupTimeout { .. } => {
             RequestTimeout::new_err((text, false))
         }
-        ClientError::Connect { to, error } => ConnectFailed::new_err((to.clone(), os_text(error))),
+        ClientError::Connect { to, error } => {
+            ConnectFailed::new_err((to.clone(), os_text(error), error.raw_os_error()))
+        }
         ClientError::Tls { to, failure, maybe_sent } => {
             let of = (failure.reason(), to.clone(), failure.to_string(), *maybe_sent);
             TlsFailed::new_err(of)

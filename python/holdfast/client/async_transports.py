@@ -377,7 +377,7 @@ class _LoopConnection:
                 except OSError as error:
                     if isinstance(error, TimeoutError) and error.errno is None:
                         raise  # Of this side, not of the system.
-                    raise ConnectFailed(str(target), explained(error)) from error
+                    raise connect_failed(target, error) from error
                 await protocol.ready
         except TimeoutError:
             raise self._not_in_time(timeout) from None
@@ -517,6 +517,13 @@ def _closed_before_sent() -> ConnectionLost:
     error = ConnectionLost(CLOSED)
     error.maybe_sent = False
     return error
+
+
+def connect_failed(target: NetworkTarget, error: OSError) -> ConnectFailed:
+    """The error of a client for that of the system."""
+    # The numbers of lookups are not those of the system.
+    number = None if isinstance(error, socket.gaierror) else error.errno
+    return ConnectFailed(str(target), explained(error), number)
 
 
 def explained(error: Exception) -> str:

@@ -6,8 +6,8 @@ import asyncio
 import contextlib
 from typing import TYPE_CHECKING
 
-from holdfast.client.async_transports import explained
-from holdfast.errors import ConnectFailed, ConnectionLost, InvalidResponse
+from holdfast.client.async_transports import connect_failed
+from holdfast.errors import ConnectionLost, InvalidResponse
 from holdfast.protocol import TURNAROUND_S
 from holdfast.types import SERIAL_FRAMES
 
@@ -29,7 +29,7 @@ async def send(target: NetworkTarget, request: Request) -> None:
     try:
         reader, writer = await asyncio.open_connection(target.host, target.port)
     except OSError as error:
-        raise ConnectFailed(str(target), explained(error)) from error
+        raise connect_failed(target, error) from error
     try:
         writer.write(request.rtu_frame(0))
         await writer.drain()
