@@ -1254,6 +1254,24 @@ def test_calls_that_wait_for_a_thread_are_told_that_the_client_was_closed() -> N
     run(main)
 
 
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
+def test_a_call_in_a_pause_is_told_that_it_was_not_sent(kind: str) -> None:
+    async def main() -> None:
+        with Stream(kind) as device:
+            url = f"{device.url}?pause_after_connect=60"
+            plc = holdfast.Client(url, timeout=10 * wire.DEADLINE)
+            task = asyncio.create_task(plc.write_register(0, 1))
+            await asyncio.to_thread(wire.until, lambda: device.is_connected, "it has connected")
+            await asyncio.sleep(0)
+            await plc.close()
+            with pytest.raises(holdfast.ConnectionLost, match="closed by this side") as error:
+                await task
+            assert not error.value.maybe_sent
+            assert device.requests == []
+
+    run(main)
+
+
 def test_a_call_whose_turn_comes_at_a_close_is_not_sent_after_it() -> None:
     async def main() -> None:
         with Stream("tcp", silent) as device:
@@ -1322,10 +1340,24 @@ def test_a_call_that_is_cancelled_before_its_first_byte_is_not_sent() -> None:
     with Stream("rtu+tcp") as device:
         client = BlockingClient(endpoints.endpoint(parse(device.url)))
         answers = iter([False, True])  # Before it connects, and before it sends.
-        with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+        with pytest.raises(holdfast.ConnectionLost, match="closed by this side") as error:
             client.call(Request.write_register(0, 1), 1, wire.DEADLINE, lambda: next(answers))
+        assert not error.value.maybe_sent
         assert client.call(Request.read("holding_registers", 7, 1), 1, wire.DEADLINE) == [7]
         assert [asked.pdu[0] for asked in device.requests] == [3]
+
+
+def test_a_call_that_is_cancelled_in_a_pause_ends_before_it() -> None:
+    with Stream("rtu+tcp") as device:
+        target = parse(f"{device.url}?pause_after_connect=10")
+        client = BlockingClient(endpoints.endpoint(target))
+        # Not before it connects, nor the second time. Without an end in the pause, that is when it
+        # is sent.
+        answers = itertools.chain([False, False], itertools.repeat(True))
+        with pytest.raises(holdfast.ConnectionLost, match="closed by this side") as error:
+            client.call(Request.write_register(0, 1), 1, wire.DEADLINE, lambda: next(answers))
+        assert not error.value.maybe_sent
+        assert device.requests == []
 
 
 def test_a_connection_without_a_free_transaction_id_is_replaced() -> None:

@@ -3,7 +3,7 @@
 use std::cell::{Cell, RefCell};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use holdfast_engine::client::{
     BlockingClient as Core, ClientError, Direction, Endpoint as CoreEndpoint, Lost, Place,
@@ -32,9 +32,6 @@ pyo3::import_exception!(holdfast.errors, ConnectionLost);
 pyo3::import_exception!(holdfast.errors, RequestTimeout);
 pyo3::import_exception!(holdfast.errors, InvalidResponse);
 pyo3::import_exception!(holdfast.errors, TlsFailed);
-
-/// The message of the `ConnectionLost` that `end_call` causes.
-const CLOSED: &str = "connection lost: closed by this side";
 
 #[pyclass(frozen, module = "holdfast")]
 pub struct Request {
@@ -344,7 +341,8 @@ impl BlockingClient {
         BlockingClient { core, ended: AtomicU64::new(0) }
     }
 
-    /// Sends a request and returns its result as a Python object.
+    /// Sends a request and returns its result as a Python object. Once `is_cancelled` returns true, the
+    /// call ends, unless its request was sent.
     #[pyo3(signature = (request, unit, timeout, is_cancelled=None))]
     fn call<'py>(
         &self,
@@ -358,19 +356,26 @@ impl BlockingClient {
         let timeout = seconds("timeout", timeout)?;
         let request = &request.encoded;
         let take = |response: Response<'_>, _: &[u8]| Reply::new(response);
-        let to_begin = || {
-            let Some(is_cancelled) = &is_cancelled else { return Ok(()) };
-            match Python::attach(|py| is_cancelled.call0(py)?.is_truthy(py)) {
-                Ok(false) => Ok(()),
-                // Without an answer, nothing is sent.
-                Ok(true) | Err(_) => Err(ClientError::Lost(Lost::Closed(Closed::BySelf))),
-            }
+        let is_cancelled = || {
+            let Some(is_cancelled) = &is_cancelled else { return false };
+            // Without an answer, nothing is sent.
+            Python::attach(|py| is_cancelled.call0(py)?.is_truthy(py)).unwrap_or(true)
         };
-        let result = self.interruptible(py, |interrupted| {
-            self.core.interruptible_call(interrupted, &to_begin, unit, request, timeout, take)
+        let to_begin = || {
+            let cancelled = || ClientError::Lost(Lost::Closed(Closed::BySelf));
+            if is_cancelled() { Err(cancelled()) } else { Ok(()) }
+        };
+        let was_sent = AtomicBool::new(false);
+        let is_over = || !was_sent.load(Ordering::Relaxed) && is_cancelled();
+        let result = self.interruptible(py, is_over, |interrupted| {
+            let called = (unit, request);
+            self.core.interruptible_call(interrupted, &to_begin, &was_sent, called, timeout, take)
         })?;
-        let result = result.ok_or_else(|| ConnectionLost::new_err(CLOSED))?;
-        result.map_err(|error| raised(&error))?.into_python(py)
+        let closed = || Err(ClientError::Lost(Lost::Closed(Closed::BySelf)));
+        result
+            .unwrap_or_else(closed)
+            .map_err(|error| of_request(py, &error, was_sent.load(Ordering::Relaxed)))?
+            .into_python(py)
     }
 
     /// Ends the call that waits for its reply, and its connection.
@@ -379,7 +384,7 @@ impl BlockingClient {
     }
 
     fn close(&self, py: Python<'_>) -> PyResult<()> {
-        self.interruptible(py, |interrupted| self.core.close(Some(interrupted)))
+        self.interruptible(py, || false, |interrupted| self.core.close(Some(interrupted)))
     }
 
     #[getter]
@@ -405,10 +410,11 @@ thread_local! {
 
 impl BlockingClient {
     /// Runs `work` without the interpreter. While it waits, handlers of Python signals run; an
-    /// exception of a handler ends it, as does `end_call`.
+    /// exception of a handler ends it, as do `end_call` and `is_over`.
     fn interruptible<T: Send>(
         &self,
         py: Python<'_>,
+        is_over: impl Fn() -> bool + Sync,
         work: impl FnOnce(&mut dyn FnMut() -> bool) -> T + Send,
     ) -> PyResult<T> {
         let me = std::ptr::from_ref(self).addr();
@@ -422,7 +428,7 @@ impl BlockingClient {
         CALLING.with_borrow_mut(|clients| clients.push(me));
         let result = py.detach(|| {
             work(&mut || {
-                if self.ended.load(Ordering::Relaxed) != ended {
+                if self.ended.load(Ordering::Relaxed) != ended || is_over() {
                     return true;
                 }
                 // Before the handlers: nothing that one of them raised is lost.
@@ -605,6 +611,15 @@ pub(crate) fn raised(error: &ClientError) -> PyErr {
         }
         ClientError::Invalid(invalid) => InvalidResponse::new_err((text, invalid.reason())),
     }
+}
+
+/// As `raised`, for the error of a request. Errors of TLS say themselves whether it may have been sent.
+pub(crate) fn of_request(py: Python<'_>, error: &ClientError, maybe_sent: bool) -> PyErr {
+    let raised = raised(error);
+    if maybe_sent || !matches!(error, ClientError::Lost(_)) {
+        return raised;
+    }
+    raised.value(py).setattr("maybe_sent", false).map_or_else(|failed| failed, |()| raised)
 }
 
 fn encoded(request: &CoreRequest<'_>) -> Request {

@@ -20,7 +20,7 @@ use pyo3::{PyTraverseError, PyVisit, intern};
 
 use crate::arguments::{byte, seconds};
 use crate::channel::Tls;
-use crate::client::{Endpoint, Request, exception, raised, show, value};
+use crate::client::{Endpoint, Request, exception, of_request, raised, show, value};
 use crate::memory::Integer;
 
 /// No call into Python is made while its state is locked, but for those that make objects: the callee could
@@ -170,6 +170,7 @@ impl Connection {
         attempt: Option<&Attempt>,
     ) -> PyResult<Bound<'py, PyAny>> {
         let (unit, within) = (byte("unit", unit.0)?, seconds("timeout", timeout)?);
+        let is_first = attempt.is_none();
         let attempt = attempt.map_or_else(Default::default, |attempt| attempt.core);
         let future = self.create_future.bind(py).call0()?;
         let mut state = lock(&self.state);
@@ -179,7 +180,10 @@ impl Connection {
         let ticket =
             match state.core.send_again(unit, &request.encoded, within, attempt, clock(now)?) {
                 Ok(ticket) => ticket.0,
-                Err(why) => return Err(raised(&self.error(&state.ending, why.failure(), within))),
+                Err(why) => {
+                    let error = self.error(&state.ending, why.failure(), within);
+                    return Err(of_request(py, &error, !is_first));
+                }
             };
         let is_alone = state.waiting.is_empty();
         state.waiting.push_back((ticket, future.clone().unbind()));
@@ -430,7 +434,10 @@ impl Connection {
                 Ok(response) => value(py, response).map(Bound::unbind),
                 Err(failure) => match done.again {
                     Some(core) => Py::new(py, Attempt { core }).map(Py::into_any),
-                    None => Err(raised(&self.error(ending, failure, done.timeout))),
+                    None => {
+                        let error = self.error(ending, failure, done.timeout);
+                        Err(of_request(py, &error, done.maybe_sent))
+                    }
                 },
             };
             completed.push((future, outcome));

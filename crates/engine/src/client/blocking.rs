@@ -5,7 +5,7 @@
 
 use std::hash::{BuildHasher, RandomState};
 use std::io::ErrorKind;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Arc, Mutex};
 use std::thread;
@@ -73,6 +73,8 @@ struct Call<'r> {
     request: &'r EncodedRequest,
     attempt: Attempt,
     conditions: &'r Conditions<'r>,
+    /// Set before its first bytes are sent.
+    was_sent: &'r AtomicBool,
     /// Why it was not sent.
     refused: Option<ClientError>,
 }
@@ -114,19 +116,21 @@ impl BlockingClient {
 
     /// As [`BlockingClient::call`], unless `interrupted` returns true. It is asked at most every 0.1 s.
     /// Returns `None` then, and the connection is closed: a reply would still come. `to_begin` is as in
-    /// [`Conditions`].
+    /// [`Conditions`]. `was_sent` becomes true before the first bytes are sent.
     pub fn interruptible_call<T>(
         &self,
         interrupted: &mut dyn FnMut() -> bool,
         to_begin: &dyn Fn() -> Result<(), ClientError>,
-        unit_id: u8,
-        request: &EncodedRequest,
+        was_sent: &AtomicBool,
+        (unit_id, request): (u8, &EncodedRequest),
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Option<Result<T, ClientError>> {
         let interrupt = Interrupt::new(Some(interrupted));
-        let conditions = Conditions { to_begin, to_go_on: None };
-        self.call_unless(interrupt, (unit_id, request, &conditions), timeout, take)
+        let conditions = &Conditions { to_begin, to_go_on: None };
+        let attempt = Attempt::default();
+        let call = Call { unit_id, request, attempt, conditions, was_sent, refused: None };
+        self.call_unless(interrupt, call, timeout, take)
     }
 
     /// Sends a request when it is the caller's turn, and passes its response and the PDU of that to
@@ -149,7 +153,10 @@ impl BlockingClient {
             None => None,
             Some(_) => Some(&mut interrupted),
         });
-        let called = self.call_unless(interrupt, (unit_id, request, conditions), timeout, take);
+        let was_sent = &AtomicBool::new(false);
+        let attempt = Attempt::default();
+        let call = Call { unit_id, request, attempt, conditions, was_sent, refused: None };
+        let called = self.call_unless(interrupt, call, timeout, take);
         called.unwrap_or_else(|| {
             assert!(conditions.to_go_on.is_some(), "nobody interrupts this call");
             Err(ClientError::Lost(Lost::Closed(Closed::BySelf)))
@@ -159,16 +166,14 @@ impl BlockingClient {
     fn call_unless<T>(
         &self,
         mut interrupt: Interrupt<'_>,
-        (unit_id, request, conditions): (u8, &EncodedRequest, &Conditions<'_>),
+        mut call: Call<'_>,
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Option<Result<T, ClientError>> {
-        let interrupt = &mut interrupt;
+        let (interrupt, conditions) = (&mut interrupt, call.conditions);
         let _turn = self.turns.take(interrupt)?;
         let mut state = lock(&self.state);
         let mut take = Some(take);
-        let mut call =
-            Call { unit_id, request, attempt: Attempt::default(), conditions, refused: None };
         let mut deadline = Instant::now() + timeout;
         loop {
             if let Err(error) = (conditions.to_begin)() {
@@ -460,6 +465,7 @@ impl Open {
                     return Ok(());
                 }
                 has_begun = true;
+                call.was_sent.store(true, Ordering::Relaxed);
                 let until = self.epoch + self.connection.deadline().unwrap_or(now - self.epoch);
                 match self.stream.send(outgoing, until) {
                     // Part of the request may have been sent.

@@ -32,6 +32,8 @@ pub struct Done<'d> {
     pub outcome: Result<Response<'d>, Failure>,
     /// The PDU of the reply; empty without one, as after a broadcast.
     pub pdu: &'d [u8],
+    /// False if no byte of it was given out for sending, nor for an attempt before.
+    pub maybe_sent: bool,
     /// The request may be sent again: give this to [`super::Connection::send_again`].
     pub again: Option<Attempt>,
 }
@@ -284,7 +286,8 @@ impl Flights {
             let failed = outcome.as_ref().err();
             let again =
                 failed.and_then(|error| attempt.next(&request, *error, stale, &self.tolerance));
-            sink(Done { ticket, timeout, outcome, pdu, again });
+            let maybe_sent = self.held.is_none() || attempt != Attempt::default();
+            sink(Done { ticket, timeout, outcome, pdu, maybe_sent, again });
         }
     }
 
