@@ -1458,6 +1458,26 @@ def test_a_client_that_nobody_has_any_more_is_closed_in_its_event_loop(is_connec
     run(main)
 
 
+def test_a_client_with_a_thread_that_nobody_has_any_more_is_closed() -> None:
+    def forget(clients: list[holdfast.Client]) -> None:
+        clients.clear()
+        gc.collect()
+
+    async def main() -> None:
+        with Stream("rtu+tcp", silent) as device:
+            clients = [holdfast.Client(device.url, timeout=10 * wire.DEADLINE)]
+            writing = asyncio.create_task(clients[0].write_register(0, 1))
+            await asyncio.to_thread(device.await_requests, 1)
+            await cancelled(writing)
+            await asyncio.sleep(0)  # The loop forgets it.
+            del writing
+            with pytest.warns(ResourceWarning, match=re.escape(f"unclosed client of {device.url}")):
+                forget(clients)
+            await asyncio.to_thread(wire.until, lambda: not device.is_connected, "it is closed")
+
+    run(main)
+
+
 def test_a_client_that_was_closed_ends_without_a_warning(server: holdfast.Server) -> None:
     async def main() -> None:
         async with holdfast.Client(url_of(server), timeout=wire.DEADLINE) as plc:

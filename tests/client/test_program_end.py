@@ -1,12 +1,14 @@
-"""A program that ends while daemon threads use clients."""
+"""A program that ends while clients are in use."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 
+import pytest
+
 from support import wire
-from support.fake_device import Stream
+from support.fake_device import ScriptedDevice, Stream, Udp, silent
 
 IN_A_DAEMON_THREAD = """
 import asyncio, sys, threading, holdfast
@@ -22,6 +24,30 @@ for _ in range(4):
     asyncio.run_coroutine_threadsafe(poll(), loop)
 has_read.wait()
 """
+
+
+CANCELLED = """
+import asyncio, sys, holdfast
+async def main():
+    plc = holdfast.Client(sys.argv[1], timeout=3600)
+    call = asyncio.create_task(plc.write_register(0, 1))
+    await asyncio.to_thread(sys.stdin.readline)
+    call.cancel()
+asyncio.run(main())
+"""
+
+
+@pytest.mark.parametrize("device", [Stream("rtu+tcp", silent), Udp(silent)], ids=["rtu+tcp", "udp"])
+def test_a_program_does_not_wait_for_a_call_that_was_cancelled(device: ScriptedDevice) -> None:
+    with device:
+        command = [sys.executable, "-c", CANCELLED, device.url]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as program:
+            try:
+                device.await_requests(1)
+                _, stderr = program.communicate(b"\n", timeout=wire.DEADLINE)
+            finally:
+                program.kill()
+    assert (program.returncode, stderr) == (0, b"")
 
 
 def test_a_program_ends_while_its_event_loop_reads_in_a_daemon_thread() -> None:

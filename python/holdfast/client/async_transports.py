@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 from holdfast._core import Attempt, BlockingClient, Connection
 from holdfast.client.endpoint import endpoint
 from holdfast.client.fork import renew_in_children
-from holdfast.client.program_end import sleep_at_end
+from holdfast.client.program_end import end_at_exit, sleep_at_end
 from holdfast.client.tcp_connect import addresses, connected
 from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
 from holdfast.runtime.text import os_error_text
@@ -64,7 +64,10 @@ class AsyncTransport(Protocol):
 class ThreadedConnection:
     """A transport with one request at a time, in a thread of its own."""
 
+    _executor: ThreadPoolExecutor | None = None
+
     def __init__(self, target: Target, trace: Trace | None = None) -> None:
+        self._target = target
         self._endpoint = endpoint(target)
         self._trace = trace
         self._connect_anew()
@@ -72,31 +75,45 @@ class ThreadedConnection:
 
     def _connect_anew(self) -> None:
         self._core = BlockingClient(self._endpoint, self._trace)
-        self._executor: ThreadPoolExecutor | None = None
+        self._executor, self._closed = None, Event()
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
         """Sends a request after the calls before it, and waits for the result."""
         if self._executor is None:
-            self._executor = ThreadPoolExecutor(1, "holdfast-client")
-        loop, executor, cancelled = asyncio.get_running_loop(), self._executor, Event()
+            self._executor, self._closed = ThreadPoolExecutor(1, "holdfast-client"), Event()
+            end_at_exit(self)
+        core, closed, cancelled = self._core, self._closed, Event()
 
+        # Without a reference to this object, which nobody may have any more after a cancellation.
         def carry() -> Any:
             # The client was closed, and possibly used again, while this call waited for its turn.
-            if executor is not self._executor:
+            if closed.is_set():
                 raise _closed_before_sent()
-            return self._core.call(request, unit, timeout, cancelled.is_set)
+            return core.call(request, unit, timeout, cancelled.is_set)
 
         try:
-            return await loop.run_in_executor(executor, carry)
+            return await asyncio.get_running_loop().run_in_executor(self._executor, carry)
         except asyncio.CancelledError:
             cancelled.set()
             raise
 
     async def close(self) -> None:
         """Closes the connection; the current call and waiting calls fail."""
-        executor, self._executor = self._executor, None
+        executor = self._leave()
         if executor is not None:
             await asyncio.to_thread(self._end, executor)
+
+    def end(self) -> None:
+        """As `close`, without an event loop."""
+        executor = self._leave()
+        if executor is not None:
+            self._end(executor)
+
+    def _leave(self) -> ThreadPoolExecutor | None:
+        """The thread, if there is one: calls that wait for it fail, and the next has a new one."""
+        self._closed.set()
+        executor, self._executor = self._executor, None
+        return executor
 
     def _end(self, executor: ThreadPoolExecutor) -> None:
         closed = executor.submit(self._core.close)
@@ -105,6 +122,16 @@ class ThreadedConnection:
             self._core.end_call()
             wait([closed], END_CALL_INTERVAL_S)
         executor.shutdown()
+
+    def __del__(self, _warn: Callable[..., None] = warnings.warn) -> None:
+        if self._executor is None:
+            return
+        _warn(f"unclosed client of {self._target}", ResourceWarning, source=self)
+        executor = self._leave()
+        assert executor is not None
+        # All its calls are cancelled: only one that was sent is left.
+        self._core.end_call()
+        executor.shutdown(wait=False)
 
     @property
     def late(self) -> int:

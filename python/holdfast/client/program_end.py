@@ -1,18 +1,23 @@
-"""Lets the event loops of daemon threads sleep when the program ends.
+"""Ends what would keep or abort a program that ends.
 
-Up to Python 3.13, the interpreter ends such a thread wherever it runs Python code. Where the native
-core has called that code, as for every reply, this would abort the process.
+The interpreter waits for the threads of clients: their calls end.
+
+The event loops of daemon threads sleep. Up to Python 3.13, the interpreter ends such a thread
+wherever it runs Python code. Where the native core has called that code, as for every reply, this
+would abort the process.
 """
 
 from __future__ import annotations
 
 import atexit
+import concurrent.futures.thread  # noqa: F401 - registers its hook before that of this module
 import contextlib
 import os
 import sys
+import threading
 import time
 from threading import Event
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 from weakref import WeakSet
 
 if TYPE_CHECKING:
@@ -21,7 +26,21 @@ if TYPE_CHECKING:
 SLEEP_S = 1.0
 """Longer than the rest of the end takes. Not for ever: a later hook may wait for the loop."""
 
+
+class Ending(Protocol):
+    """What has a thread that the interpreter waits for."""
+
+    def end(self) -> None:
+        """Ends the thread, and what it does."""
+
+
+_threaded: WeakSet[Ending] = WeakSet()
 _loops: WeakSet[AbstractEventLoop] = WeakSet()
+
+
+def end_at_exit(threaded: Ending) -> None:
+    """Ends it if the program ends before its owner has closed it."""
+    _threaded.add(threaded)
 
 
 def sleep_at_end(loop: AbstractEventLoop) -> None:
@@ -43,6 +62,14 @@ def _end() -> None:
                 sleeps.wait(SLEEP_S)
 
 
+def _end_threads() -> None:
+    for threaded in list(_threaded):
+        threaded.end()
+
+
+# The hooks of `atexit` run after the interpreter has waited for all threads. These run before, the
+# last first: that of `concurrent.futures` waits for its threads.
+threading._register_atexit(_end_threads)  # type: ignore[attr-defined]
 if sys.version_info < (3, 14):
     atexit.register(_end)
 if hasattr(os, "register_at_fork"):
