@@ -282,10 +282,10 @@ class Stale(OSError):
 class MirrorAge:
     """How old the values of a range are: a write of the poller to the whole range renews them.
 
-    Values that were read under another lease, or before this was made, are of another device: they
-    don't. Values are stale `after` seconds, and before the first write. With `refuses`, a memory
-    refuses to read and write them then. Thread-safe; the time goes on while the machine is
-    suspended.
+    Values that were read under another lease are of another device, and so are those without a
+    lease from before this was made: they don't. Values are stale `after` seconds, and before the
+    first write. With `refuses`, a memory refuses to read and write them then. Thread-safe; the time
+    goes on while the machine is suspended.
     """
 
     def __new__(cls, after: float, *, refuses: bool, lease: int | None = ...) -> MirrorAge: ...

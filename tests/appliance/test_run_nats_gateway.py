@@ -249,7 +249,7 @@ def test_after_a_reload_subscriptions_go_on(
         assert appliance.reload(load(tmp_path / "appliance.yaml")) == ["nats"]
         until_connected(appliance)
 
-    text = nats_section(nats.url) + "  keep_subscriptions: false\n"
+    text = MODBUS + nats_section(nats.url) + "  keep_subscriptions: false\n"
     appliance = run(text)
     data = caller.listen("plant.data.plc1")
     assert subscribed(caller, server)["success"] is True
@@ -270,11 +270,19 @@ def test_after_a_reload_subscriptions_go_on(
     reload(text)
     assert caller.request("plant.browse", b"")["count"] == 1
 
-    reload(text.replace("plant", "other"))
+    other = text.replace("prefix: plant", "prefix: other")
+    reload(other)
     assert caller.request("other.browse", b"")["count"] == 0
+    assert subscribed(caller, server, "other")["success"] is True
+    (tmp_path / "appliance.yaml").write_text(MODBUS)
+    assert appliance.reload(load(tmp_path / "appliance.yaml")) == ["nats"]
+    reload(other)
+    assert caller.request("other.browse", b"")["count"] == 0
+
+    assert subscribed(caller, server, "other")["success"] is True
     caller.publish("other.shutdown")
     wire.until(lambda: log.of("adapter_stopped"), "the scanner has ended")
-    reload(text.replace("plant", "other") + "  limits: {tags: 7}\n")
+    reload(other + "  limits: {tags: 7}\n")
     assert caller.request("other.browse", b"")["count"] == 0
 
 

@@ -41,7 +41,7 @@ class ScannerAdapter:
         self._settings = settings
         self._scanner = Scanner(settings, poller, start_thread, former)
         self.heartbeat = Heartbeat()
-        self.subscriptions: list[SubscribeRequest] = []
+        self.subscriptions = list(former)
         """Requests that make its subscriptions, after its end; none after a shutdown message."""
 
     def run(self, stop: Stop) -> None:

@@ -63,8 +63,12 @@ impl Freshness for MirrorAge {
     fn renew(&self, age: Duration, lease: Option<u64>) {
         let known = (self.clock)().saturating_sub(age);
         // Before a reload, or on a node that is not reloaded yet, another device may be read into the range.
-        let is_of_another = self.lease.zip(lease).is_some_and(|(own, other)| own != other);
-        if is_of_another || known < self.began {
+        // A lease tells; without one, values from before the range was of this device are not of it.
+        let is_of_device = match self.lease.zip(lease) {
+            Some((own, other)) => own == other,
+            None => known >= self.began,
+        };
+        if !is_of_device {
             return;
         }
         // Values that are written later are no older, also if less is known of their age.
@@ -141,10 +145,10 @@ mod tests {
         age.renew(Duration::ZERO, Some(LEASE + 1));
         assert!(age.is_stale(), "another node reads another device into the range");
         pass(3);
-        age.renew(Duration::from_secs(4), Some(LEASE));
+        age.renew(Duration::from_secs(4), None);
         assert!(age.is_stale(), "they were read before the range was of this device");
-        age.renew(Duration::from_secs(3), Some(LEASE));
-        assert!(!age.is_stale());
+        age.renew(Duration::from_secs(4), Some(LEASE));
+        assert!(!age.is_stale(), "a node that follows knows only how old they are at most");
     }
 
     #[test]

@@ -218,7 +218,9 @@ class _LogLeases:
     def _unheld(self, key: str) -> str | None:
         """Why nobody holds a lease; `None` if somebody does, or may take it soon."""
         seen = self.leases.seen.get(key)
-        since = max(self._wanted_since.get(key, 0.0), 0.0 if seen is None else seen.seen)
+        wanted = self._wanted_since.get(key, 0.0)
+        # Nobody takes a lease of a new bucket before.
+        since = max(wanted, self.leases.may_settle_at, 0.0 if seen is None else seen.seen)
         is_late = time.monotonic() - since > self.leases.times.unheld_s
         if not is_late or self.leases.holder(key) is not None:
             return None

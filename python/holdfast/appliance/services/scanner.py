@@ -30,6 +30,7 @@ class ScannerService(Service):
     def adapters(self, config: Config, running: Services) -> Iterator[Supervisor]:
         """Yields the adapter, if configured."""
         if config.nats is None:
+            self._former = None  # What clients want may be something else when there is one again.
             return
         from holdfast.scanner.adapter import ScannerAdapter
 
@@ -40,8 +41,7 @@ class ScannerService(Service):
             former: list[SubscribeRequest] = []
             if self._former is not None:
                 before, of = self._former
-                # Subscribers of another prefix don't know where values have gone.
-                if (of.prefix, of.dialect) == (settings.prefix, settings.dialect):
+                if _clients(of) == _clients(settings):
                     former = before.subscriptions
             made = ScannerAdapter(settings, poller, starter.start, former)
             self._former = made, settings
@@ -55,6 +55,11 @@ class ScannerService(Service):
             may_end=True,
             starter=starter,
         )
+
+
+def _clients(settings: Settings) -> tuple[object, ...]:
+    """Whom a scanner serves: subscriptions of others are not theirs."""
+    return settings.prefix, settings.dialect, settings.servers.urls, settings.fleet
 
 
 def scanner_settings(

@@ -81,7 +81,7 @@ class HttpEndpoint:
 
 
 class Service:
-    """A kind of service. It has no state: `Services` has the running adapters.
+    """A kind of service. `Services` has the running adapters.
 
     The library of a service is imported only where the service is configured.
     """

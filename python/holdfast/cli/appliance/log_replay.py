@@ -140,18 +140,20 @@ def replay(
                 if not replaying.ended:
                     fail("interrupted", reason="interrupted")
                 _check_end(replaying, sequence, time_ns)
+                if chosen is not None and output is not None:
+                    areas = {
+                        area: KeptArea(
+                            addresses.start, chosen.read(area, addresses.start, len(addresses))
+                        )
+                        for area, addresses in _areas_and_files(chosen)
+                    }
+                    text = memory_file.written(areas, memory_file.kind_of(output), zeros=False)
+                    memory_file.write(output, text)
                 _tell(file, replaying, memories, values=values, as_json=as_json)
         except (_core.LogError, ServerUnusable, ValueError) as error:
             shown = nats_servers(settings).shown
             where = f" (servers: {shown})" if isinstance(error, _core.LogError) else ""
             fail(f"logs.{log}: {error}{where}", reason="connection" if where else "failed")
-    if chosen is not None and output is not None:
-        areas = {
-            area: KeptArea(addresses.start, chosen.read(area, addresses.start, len(addresses)))
-            for area, addresses in _areas_and_files(chosen)
-        }
-        text = memory_file.written(areas, memory_file.kind_of(output), zeros=False)
-        memory_file.write(output, text)
     if bind is not None and not signals.received:
         _serve(memories, bind, signals, as_json=as_json)
 

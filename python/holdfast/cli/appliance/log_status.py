@@ -50,7 +50,7 @@ def log_status(file: Path, as_json: bool) -> None:
 
 def _is_well(status: dict[str, Any]) -> bool:
     differs = status["digest"] is not None and status["digest"][2] is False
-    unpolled = any(device["reason"] for device in status["devices"].values())
+    unpolled = any(device.get("reason") for device in status["devices"].values())
     return status["obstacle"] is None and not differs and not unpolled
 
 
@@ -83,8 +83,8 @@ def _shown(name: str, status: dict[str, Any]) -> list[str]:
 
 def _polled(device: str, found: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield device, "nobody" if found["node"] is None else found["node"]
-    if found["reason"] is not None:
-        yield "", found["reason"]
+    if (reason := found.get("reason")) is not None:
+        yield "", reason
 
 
 def _row(node: dict[str, Any], status: dict[str, Any]) -> tuple[str, ...]:

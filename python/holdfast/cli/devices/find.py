@@ -18,7 +18,7 @@ from holdfast.cli.devices.find_units import find_units
 from holdfast.cli.options.duration import Duration, time_option, timeout_option
 from holdfast.cli.options.option import DecimalNumber, flag, json_option, number_option, option
 from holdfast.cli.options.units import unit_ids
-from holdfast.cli.options.url import SERIAL_DEVICE, checked_url
+from holdfast.cli.options.url import checked_url, is_serial_device
 from holdfast.client.url import SerialTarget, parse
 from holdfast.config.values.ip_addresses import parse_source
 from holdfast.discovery import device_search
@@ -92,7 +92,7 @@ def find(
 
     Exit codes: 0 a device was found; 1 none was, or the search ended early; 2 wrong usage.
     """
-    if any("://" in each or SERIAL_DEVICE.fullmatch(each) for each in targets):
+    if any("://" in each or is_serial_device(each) for each in targets):
         if len(targets) > 1:
             raise click.UsageError("Give one URL or one serial line, or several networks.")
         [target] = targets

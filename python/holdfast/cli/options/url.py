@@ -22,6 +22,11 @@ def is_url(text: str) -> bool:
     return "://" in text or (_is_address(text) and not Path(text).exists())
 
 
+def is_serial_device(text: str) -> bool:
+    """Whether an argument is the device of a serial line."""
+    return SERIAL_DEVICE.fullmatch(text) is not None and not text.lower().endswith(FILES)
+
+
 def checked_url(text: str) -> str:
     """Checks the URL of a device; a host without a scheme is one over TCP.
 
@@ -37,14 +42,13 @@ def checked_url(text: str) -> str:
 
 def _url_of(text: str) -> str:
     """The URL of a host without a scheme. Raises `click.BadParameter` for other text."""
-    is_file = text.lower().endswith(FILES)
-    if SERIAL_DEVICE.fullmatch(text) and not is_file:
+    if is_serial_device(text):
         raise click.BadParameter(
             f"{text!r} is a serial line: type rtu://{text}?baud=19200&parity=even, with its "
             f"settings. 'holdfast find {text}' finds them."
         )
     name, _, port = text.partition(":")
-    is_host = HOST.fullmatch(text) is not None and not is_file
+    is_host = HOST.fullmatch(text) is not None and not text.lower().endswith(FILES)
     if _is_address(text) or (is_host and ("." in name or port or name == "localhost")):
         return f"tcp://{bracketed(text) if ADDRESS_6.fullmatch(text) else text}"
     hint = f"; for a host of that name, type tcp://{text}" if is_host else ""

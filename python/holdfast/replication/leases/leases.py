@@ -138,7 +138,7 @@ class Leases:
         """Whether JetStream has refused a write, and none was accepted since."""
         self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
         self._made_at: datetime | None = None
-        self._may_settle_at = 0.0
+        self.may_settle_at = 0.0
         self._news = asyncio.Event()
         self._heard = self._acknowledged = 0.0
         self._tasks: set[asyncio.Task[None]] = set()
@@ -311,7 +311,7 @@ class Leases:
             self._made_at = created
             self.seen.clear()
             self.is_read = self._is_refused = False
-            self._may_settle_at = time.monotonic() + self.times.settle_s
+            self.may_settle_at = time.monotonic() + self.times.settle_s
 
     @property
     def _latest(self) -> int:
@@ -357,7 +357,7 @@ class Leases:
         if self._bucket is None or not self._is_checked or not self.is_read:
             return
         if SETTLED not in self.seen:
-            if now >= self._may_settle_at and not self._is_settling:
+            if now >= self.may_settle_at and not self._is_settling:
                 self._is_settling = True
                 self._begin(self._settle(self._bucket))
             return
