@@ -1399,9 +1399,9 @@ class Link:
 
     @property
     def error(self) -> str | None:
-        """Why requests fail: its address can't be reached, or several had no answer.
+        """Why requests of clients fail: its address can't be reached, or several had no answer.
 
-        `None` while something behind it answers.
+        `None` while something behind it answers them. Polls do not count.
         """
 
     def route(self, name: str, *, timeout: float, unit: int | None = None) -> Route:

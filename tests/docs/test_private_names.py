@@ -27,7 +27,10 @@ PRODUCT = ROOT / "python" / "holdfast"
 UNDOCUMENTED = ("nats.aio.transport", "nats.protocol")
 """Modules that nothing in their package's documentation speaks of."""
 
-VARIABLES = {"net/nats/batch.py": {"client": "nats.aio.client.Client"}}
+VARIABLES = {
+    "client/program_end.py": {"threading": "threading"},
+    "net/nats/batch.py": {"client": "nats.aio.client.Client"},
+}
 """What variables hold that a file takes private names of, by their names."""
 
 DERIVED = {"BrokerClient": "paho.mqtt.client.Client"}
@@ -109,7 +112,10 @@ def uses(file: str, tree: ast.Module, own: frozenset[str]) -> Iterator[Use]:
         if not isinstance(node, ast.Attribute) or node in inside:
             continue
         variable = variables.get(name_of(node.value))
-        if variable is not None and node.attr in private_members(loaded(variable)):
+        if variable in sys.stdlib_module_names:
+            if is_hidden(node.attr):
+                yield Use(file, variable, node.attr)
+        elif variable is not None and node.attr in private_members(loaded(variable)):
             yield Use(file, variable, node.attr)
         elif is_hidden(node.attr) and node.attr not in own:
             yield Use(file, variable or "?", node.attr)
@@ -221,7 +227,8 @@ def test_the_versions_of_packages_with_private_names_are_capped() -> None:
     requirements = [*project["dependencies"], *(each for extra in of_extras for each in extra)]
     required = {each.name: each for each in map(Requirement, requirements)}
     distributions = {"nats": "nats-py", "paho": "paho-mqtt"}
-    for top in {use.owner.partition(".")[0] for use in in_table()}:
+    tops = {use.owner.partition(".")[0] for use in in_table()}
+    for top in tops - sys.stdlib_module_names:
         name = distributions.get(top, top)
         installed = Version(importlib.metadata.version(name))
         following = f"{installed.major}.{installed.minor + 1}.0"

@@ -156,8 +156,8 @@ impl SharedLink {
         self.strays.get().map(|strays| &**strays)
     }
 
-    /// Why requests fail: the address can't be reached, or several in a row had no answer, for a while. `None`
-    /// while something behind the link answers.
+    /// Why requests of clients fail: the address can't be reached, or several in a row had no answer, for a
+    /// while. `None` while something behind the link answers them. Polls do not count.
     pub fn error(&self) -> Option<Arc<ClientError>> {
         lock(&self.error).clone()
     }

@@ -88,12 +88,14 @@ impl Serving {
         }
         // Requests before this one may have opened a breaker while it waited.
         let mut replies = self.admitted(unit_id, &request, replies, &shared);
-        let Some(timeout) = replies.iter().map(Reply::timeout).max() else { return };
+        if replies.is_empty() {
+            return;
+        }
         // Who has given up until now was told that nothing is sent.
         replies.retain(Reply::is_next);
-        if replies.is_empty() {
+        let Some(timeout) = replies.iter().map(Reply::timeout).max() else {
             return counters.withdrawn.add();
-        }
+        };
         let changes = self.link.changes.get();
         let answered =
             self.link.exchange(unit_id, &request, timeout, true, &Permit::default()).await;
