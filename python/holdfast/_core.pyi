@@ -283,9 +283,9 @@ class MirrorAge:
     """How old the values of a range are: a write of the poller to the whole range renews them.
 
     Values that were read under another lease are of another device, and so are those without a
-    lease from before this was made: they don't. Values are stale `after` seconds, and before the
-    first write. With `refuses`, a memory refuses to read and write them then. Thread-safe; the time
-    goes on while the machine is suspended.
+    lease from before this was made: they renew nothing. Values are stale `after` seconds, and
+    before the first write. With `refuses`, a memory refuses to read and write them then.
+    Thread-safe; the time goes on while the machine is suspended.
     """
 
     def __new__(cls, after: float, *, refuses: bool, lease: int | None = ...) -> MirrorAge: ...
@@ -1402,6 +1402,11 @@ class Link:
         """Why requests of clients fail: its address can't be reached, or several had no answer.
 
         `None` while something behind it answers them. Polls do not count.
+        """
+
+    def set_longest_wait(self, wait: float | None) -> None:
+        """How many seconds a call may keep others of the link waiting for its reply: as long as
+        clients of its routes wait. `None`: it has no routes.
         """
 
     def route(self, name: str, *, timeout: float, unit: int | None = None) -> Route:

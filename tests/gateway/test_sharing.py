@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from holdfast.config import load
 from support import wire
 from support.fake_device import HANG_UP, FakeDevice, Stream, exception, silent
 from support.routed import Held, await_count, counters
@@ -15,6 +16,7 @@ from support.shared import Careful, ask, polled, read, unanswered, with_gateway
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from holdfast.appliance import Appliance
     from support.fake_device import Asked
@@ -114,6 +116,18 @@ def test_single_writes_take_the_functions_for_several_where_the_device_needs_it(
 def test_a_silent_device_is_waited_for_no_longer_than_by_clients_of_the_link(run: Run) -> None:
     with Stream("tcp", then=silent) as device:
         appliance = run(with_gateway(device.url, link={"timeout": 0.1}))
+        asked = ask(appliance, "/read", device.port, functionCode=3, address=5, timeout=60_000)
+    assert failure(asked) == (500, "timeout", "Connection timeout")
+
+
+def test_a_reload_changes_how_long_the_gateway_waits_for_a_silent_device(
+    run: Run, tmp_path: Path
+) -> None:
+    with Stream("tcp", then=silent) as device:
+        appliance = run(with_gateway(device.url))
+        file = tmp_path / "appliance.yaml"
+        file.write_text(with_gateway(device.url, link={"timeout": 0.1}))
+        appliance.reload(load(file))
         asked = ask(appliance, "/read", device.port, functionCode=3, address=5, timeout=60_000)
     assert failure(asked) == (500, "timeout", "Connection timeout")
 

@@ -74,11 +74,18 @@ pub struct Link {
 impl Link {
     #[pyo3(signature = (name, *, timeout, unit=None))]
     fn route(&self, name: &str, timeout: f64, unit: Option<i128>) -> PyResult<Route> {
-        let timeout = seconds("timeout", timeout)?;
-        let unit_id = unit.map(|unit| byte("unit", unit)).transpose()?;
-        self.core.note_route(timeout);
-        let core = CoreRoute { name: name.into(), link: Arc::clone(&self.core), unit_id, timeout };
+        let core = CoreRoute {
+            name: name.into(),
+            link: Arc::clone(&self.core),
+            unit_id: unit.map(|unit| byte("unit", unit)).transpose()?,
+            timeout: seconds("timeout", timeout)?,
+        };
         Ok(Route { core })
+    }
+
+    fn set_longest_wait(&self, wait: Option<f64>) -> PyResult<()> {
+        self.core.set_longest_wait(wait.map(|wait| seconds("wait", wait)).transpose()?);
+        Ok(())
     }
 
     #[pyo3(signature = (caller, request, unit, timeout, *, broadcast=false))]

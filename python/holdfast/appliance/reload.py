@@ -102,10 +102,12 @@ def restart_reasons(before: Config, now: Config) -> Iterator[str]:
     if fingerprint(before.audit) != fingerprint(now.audit):
         yield "audit: changed"
     in_use = _connections_in_use(before)
-    links = {_address(link): link for link in before.links.values()}
+    links = {shared_connection(link.target): link for link in before.links.values()}
     for name, link in now.links.items():
         own = set(type(link).model_fields) - {"url", "timeout", "tolerance"}
-        if _is_changed(in_use, link) or _differs(links.get(_address(link)), link, own):
+        if _is_changed(in_use, link) or _differs(
+            links.get(shared_connection(link.target)), link, own
+        ):
             yield f"links.{name}: settings of a connection in use changed"
     for name, device in _deciding_devices(now):
         if _is_changed(in_use, device):
@@ -119,21 +121,17 @@ def _connections_in_use(config: Config) -> dict[tuple[str, str], list[object]]:
     users: list[DeviceConfig | LinkConfig] = list(config.links.values())
     users += [device for _, device in _deciding_devices(config)]
     for user in users:
-        found.setdefault(_address(user), []).append(_connection_settings(user))
+        found.setdefault(shared_connection(user.target), []).append(_connection_settings(user))
     return found
 
 
 def _deciding_devices(config: Config) -> Iterator[tuple[str, DeviceConfig]]:
     """The devices that are used, and whose connection does not have the settings of a link."""
-    linked = {_address(link) for link in config.links.values()}
+    linked = {shared_connection(link.target) for link in config.links.values()}
     named = routed(config)
     for name, device in config.devices.items():
-        if (device.enabled or name in named) and _address(device) not in linked:
+        if (device.enabled or name in named) and shared_connection(device.target) not in linked:
             yield name, device
-
-
-def _address(user: DeviceConfig | LinkConfig) -> tuple[str, str]:
-    return shared_connection(user.target)
 
 
 def _connection_settings(user: DeviceConfig | LinkConfig) -> object:
@@ -145,7 +143,7 @@ def _is_changed(
     in_use: Mapping[tuple[str, str], list[object]], user: DeviceConfig | LinkConfig
 ) -> bool:
     """Whether the connection of a device or link is in use with other settings."""
-    known = in_use.get(_address(user))
+    known = in_use.get(shared_connection(user.target))
     return known is not None and _connection_settings(user) not in known
 
 

@@ -82,7 +82,7 @@ pub struct SharedLink {
     preferred: Vec<IpAddr>,
     tolerance: Tolerance,
     has_rtu_frames: bool,
-    /// The longest wait for a reply of its routes, in nanoseconds; 0 without routes.
+    /// In nanoseconds; 0 for no limit.
     longest_wait: AtomicU64,
 }
 
@@ -171,14 +171,13 @@ impl SharedLink {
         self.queue.waiting()
     }
 
-    /// The clients of a route wait so long for a reply.
-    pub fn note_route(&self, timeout: Duration) {
-        let nanos = u64::try_from(timeout.as_nanos()).unwrap_or(u64::MAX);
-        self.longest_wait.fetch_max(nanos, Ordering::Relaxed);
+    /// Sets how long an event loop may keep the line waiting for one reply: no longer than clients of its
+    /// routes, who wait for it meanwhile. `None`: it has no routes.
+    pub fn set_longest_wait(&self, wait: Option<Duration>) {
+        let nanos = wait.map_or(0, |wait| u64::try_from(wait.as_nanos()).unwrap_or(u64::MAX));
+        self.longest_wait.store(nanos, Ordering::Relaxed);
     }
 
-    /// How long an event loop may keep the line waiting for one reply: no longer than clients of routes, who
-    /// wait for it meanwhile.
     fn longest_wait(&self) -> Duration {
         match self.longest_wait.load(Ordering::Relaxed) {
             0 => Duration::MAX,

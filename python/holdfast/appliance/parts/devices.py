@@ -102,6 +102,7 @@ class Devices(Part):
             self.passages.update(plan.links.passages)
             for name in self.passages.keys() - plan.links.passages.keys():
                 del self.passages[name]
+            plan.links.limit_waits(self._links)
             self._links = plan.links.links
             gone = self._polled - polled
             if poller is not None:

@@ -32,6 +32,20 @@ class Links:
     """By the name of the link or device."""
     passages: dict[str, _core.Passage] = field(default_factory=dict)
     """By the name of the memory."""
+    waits: dict[str, float] = field(default_factory=dict)
+    """How many seconds clients of the routes of a link wait for a reply, at most; by its name."""
+
+    def add_route(self, name: str, link: _core.Link, timeout: float, unit: int | None) -> None:
+        """Adds the route of a link or device."""
+        self.routes[name] = link.route(name, unit=unit, timeout=timeout)
+        self.waits[link.name] = max(timeout, self.waits.get(link.name, 0.0))
+
+    def limit_waits(self, before: Mapping[str, _core.Link]) -> None:
+        """Limits the calls of the gateway on all links, instead of those `before`."""
+        for link in before.values():
+            link.set_longest_wait(None)
+        for name, link in self.links.items():
+            link.set_longest_wait(self.waits.get(name))
 
 
 def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) -> Links:
@@ -53,7 +67,7 @@ def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) 
             retry=settings.retry.pauses,
         )
         made.links[name] = link
-        made.routes[name] = link.route(name, timeout=settings.timeout)
+        made.add_route(name, link, settings.timeout, None)
     for name in routed(config):
         if name not in config.devices:
             continue
@@ -65,7 +79,7 @@ def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) 
             retry=device.retry.pauses,
         )
         made.links.setdefault(link.name, link)
-        made.routes[name] = link.route(name, unit=device.unit, timeout=device.timeout)
+        made.add_route(name, link, device.timeout, device.unit)
     passed: dict[str, list[tuple[Area, int, int, str, int, bool]]] = {}
     for name, device in config.devices.items():
         for read, into in device.passed:

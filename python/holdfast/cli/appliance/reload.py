@@ -19,9 +19,10 @@ def reload(file: Path) -> None:
 
     The whole configuration and all files that it names are checked first. If anything is wrong, the
     appliance goes on as before, and every problem is printed. Warnings are those of `holdfast
-    check`. Exit codes: 0 reloaded, 1 no
-    appliance of this user runs FILE, or it does not answer, 2 refused, 3 an internal error: restart
-    the appliance.
+    check`.
+
+    Exit codes: 0 reloaded, 1 no appliance of this user runs FILE, or it does not answer, 2 refused,
+    3 an internal error: restart the appliance.
     """
     try:
         answer = ask(file, "reload", within_s=RELOAD_TIMEOUT_S)

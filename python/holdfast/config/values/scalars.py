@@ -28,6 +28,7 @@ from pydantic.config import JsonDict
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+from holdfast.client.base import MAX_INTERVAL_S
 from holdfast.client.url import (
     FORMS,
     RECEIVER_FORM,
@@ -62,7 +63,7 @@ from holdfast.types import Area
 MAX_BYTES = 244
 MAX_CONNECTIONS = 65535
 MAX_DEVICE = 4095
-MAX_TIME = 31_622_400
+MAX_TIME = MAX_INTERVAL_S
 MIN_TIME = 0.001
 
 NOT_ON_A_LINE = f"; 0 is the broadcast, {MAX_SERIAL_UNIT + 1} to {MAX_UNIT} are reserved"

@@ -20,8 +20,14 @@ pub(in crate::link) enum Source {
 #[derive(Debug)]
 pub(in crate::link) struct QueueShare {
     most: usize,
+    waiting: Mutex<Waiting>,
+}
+
+#[derive(Debug, Default)]
+struct Waiting {
+    all: usize,
     /// Those of each source that has any.
-    waiting: Mutex<HashMap<Source, usize>>,
+    by_source: HashMap<Source, usize>,
 }
 
 /// A place in the queue, until it is dropped.
@@ -43,18 +49,18 @@ impl QueueShare {
     }
 
     pub(in crate::link) fn waiting(&self) -> usize {
-        lock(&self.waiting).values().sum()
+        lock(&self.waiting).all
     }
 
     /// A place for a request, unless the queue is full for its source.
     pub(in crate::link) fn place(self: &Arc<QueueShare>, source: Source) -> Option<Place> {
         let mut waiting = lock(&self.waiting);
-        let all: usize = waiting.values().sum();
-        let own = waiting.get(&source).copied().unwrap_or_default();
-        if self.most.saturating_sub(all) <= own {
+        let own = waiting.by_source.get(&source).copied().unwrap_or_default();
+        if self.most.saturating_sub(waiting.all) <= own {
             return None;
         }
-        *waiting.entry(source).or_default() += 1;
+        waiting.all += 1;
+        waiting.by_source.insert(source, own + 1);
         Some(Place { queue: Arc::clone(self), source })
     }
 }
@@ -62,10 +68,12 @@ impl QueueShare {
 impl Drop for Place {
     fn drop(&mut self) {
         let mut waiting = lock(&self.queue.waiting);
-        let own = waiting.get_mut(&self.source).expect("a source with a place is counted");
+        waiting.all -= 1;
+        let own =
+            waiting.by_source.get_mut(&self.source).expect("a source with a place is counted");
         *own -= 1;
         if *own == 0 {
-            waiting.remove(&self.source);
+            waiting.by_source.remove(&self.source);
         }
     }
 }
@@ -85,6 +93,7 @@ mod tests {
         assert_eq!(queue.waiting(), 6);
         assert!(queue.place(one).is_none());
         places.clear();
-        assert!(lock(&queue.waiting).is_empty());
+        assert_eq!(queue.waiting(), 0);
+        assert!(lock(&queue.waiting).by_source.is_empty());
     }
 }

@@ -91,7 +91,7 @@ impl Serving {
         if replies.is_empty() {
             return;
         }
-        // Who has given up until now was told that nothing is sent.
+        // Callers that have given up already know that nothing is sent.
         replies.retain(Reply::is_next);
         let Some(timeout) = replies.iter().map(Reply::timeout).max() else {
             return counters.withdrawn.add();
