@@ -424,14 +424,24 @@ def test_a_write_of_rest_is_not_sent_once_its_client_has_gone(
     assert [line["outcome"] for line in writes(log)] == ["withdrawn", "done", "done"]
 
 
-def test_the_end_of_rest_withdraws_what_was_not_sent(run: Run) -> None:
+def test_the_end_of_rest_withdraws_what_was_not_sent(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called: list[Any] = []
+    call_device = MemoryAccess.call_device
+
+    def calling(*arguments: Any) -> int:
+        called.append(arguments)
+        return call_device(*arguments)
+
+    monkeypatch.setattr(MemoryAccess, "call_device", calling)
     device_writes = HeldWrites()
     with plc(device_writes) as source, ThreadPoolExecutor(1) as threads:
         appliance = started(run, source)
         with posted(appliance, 1) as sent:
             held = device_writes.next()
             with posted(appliance, 2) as waiting:
-                wire.until(lambda: connections(appliance) == 2, "both have arrived")
+                wire.until(lambda: len(called) == 2, "both have arrived")
                 stopping = threads.submit(appliance.stop)
                 refused = answer(waiting)
             held.answer()

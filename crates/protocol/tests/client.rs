@@ -1176,6 +1176,12 @@ fn a_reply_that_is_cut_off_by_another_one_is_not_believed() {
     let ticket = client.send(request);
     client.receive(&[&reply[..], &[9; 20]].concat());
     assert_eq!(client.got(), [(ticket, Ok(vec![0, 1, 0, 2]))]);
+    // Nor if the last values and the first of the other bytes are like a header of a wrong length.
+    let mut client = Client::new(Transport::Tcp);
+    let ticket = client.send(request);
+    let values = mbap_frame(0, 7, &[3, 4, 0, 1, 0, 0]);
+    client.receive(&[&values[..], &[0, 0, 0xFF, 0xFF, 9, 9]].concat());
+    assert_eq!(client.got(), [(ticket, Ok(vec![0, 1, 0, 0]))]);
 }
 
 #[test]

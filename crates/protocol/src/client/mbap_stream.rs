@@ -267,7 +267,11 @@ impl Stream {
         let has_protocol_id = behind.iter().skip(2).take(2).any(|byte| *byte != 0);
         (has_protocol_id || matches!(mbap::next(behind), Next::Broken { .. }))
             && (mbap::HEADER_LEN + 1..len).any(|at| match bytes.get(at..) {
-                Some([high, low, 0, 0, ..]) => self.is_recent(u16::from_be_bytes([*high, *low])),
+                Some(other @ [high, low, 0, 0, ..]) => {
+                    let id = u16::from_be_bytes([*high, *low]);
+                    // Of a length that no reply has, they are values.
+                    self.is_recent(id) && !matches!(mbap::next(other), Next::Broken { .. })
+                }
                 _ => false,
             })
     }
