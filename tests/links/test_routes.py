@@ -659,18 +659,40 @@ def test_a_client_that_connects_again_and_again_leaves_places_to_others(
     first = connect(scada(appliance))
     first.send(wire.frame(READ))
     device.await_requests(1)
-    gone = connect(scada(appliance))
-    gone.send(wire.frame(WRITE))
+    second, again = connect(scada(appliance)), connect(scada(appliance))
+    second.send(wire.frame(WRITE))
     await_count(appliance, "waiting", 2)
-    gone.reset()
 
-    again = connect(scada(appliance))
     assert again.ask(WRITE) == exception(WRITE, 6)
     other = connect(scada(appliance), source="127.0.0.2")
     other.send(wire.frame(WRITE))
     await_count(appliance, "waiting", 3)
     held.release()
     assert other.receive().pdu == WRITE
+
+
+@pytest.mark.parametrize("request_", [READ, WRITE], ids=["a read that others share", "a write"])
+def test_a_client_that_has_gone_keeps_no_place_in_the_queue(
+    device: Stream, run: Run, connect: Connect, request_: bytes
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url))
+    first, gone, other = (connect(scada(appliance)) for _ in range(3))
+    first.send(wire.frame(bytes.fromhex("0300060001")))
+    device.await_requests(1)
+    gone.send(wire.frame(request_))
+    await_count(appliance, "waiting", 2)
+    other.send(wire.frame(READ))
+    await_count(appliance, "waiting", 3)
+    await_count(appliance, "coalesced", int(request_ == READ))
+    gone.reset()
+
+    await_count(appliance, "withdrawn", 1)
+    assert counters(appliance)["waiting"] == 2
+    held.release()
+    assert other.receive().pdu == FIVE
+    assert [asked.pdu for asked in device.requests][1:] == [READ]
 
 
 def test_the_write_of_a_client_that_has_gone_is_not_sent(

@@ -1,5 +1,6 @@
 //! A link as listeners and event loops see it, from any thread.
 
+use std::future;
 use std::net::IpAddr;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
@@ -279,6 +280,20 @@ impl Reply {
         match &self.to {
             Receiver::Listener(to, _) => to.is_unwanted(),
             Receiver::EventLoop(to) => to.is_unwanted(),
+        }
+    }
+
+    /// Waits until the client of a listener has disconnected.
+    pub(super) fn client_gone(&self) -> impl Future<Output = ()> + use<> {
+        let gone = match &self.to {
+            Receiver::Listener(to, _) => Some(to.gone()),
+            Receiver::EventLoop(_) => None,
+        };
+        async move {
+            match gone {
+                Some(gone) => gone.await,
+                None => future::pending().await,
+            }
         }
     }
 

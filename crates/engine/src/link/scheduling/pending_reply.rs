@@ -6,14 +6,21 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::task::{Context, Poll};
 
-use tokio::sync::oneshot;
 use tokio::sync::oneshot::error::RecvError;
+use tokio::sync::{Notify, oneshot};
 
 /// The two ends of a reply: where it is sent, and where it is awaited.
 pub(crate) fn pending_reply() -> (ReplyTo, PendingReply) {
     let (to, from) = oneshot::channel();
-    let unwanted = Arc::new(AtomicBool::new(false));
-    (ReplyTo { to, unwanted: Arc::clone(&unwanted) }, PendingReply { from, unwanted })
+    let client = Arc::<Client>::default();
+    (ReplyTo { to, client: Arc::clone(&client) }, PendingReply { from, client })
+}
+
+/// Whether the client that waits for a reply has disconnected.
+#[derive(Debug, Default)]
+struct Client {
+    is_gone: AtomicBool,
+    gone: Notify,
 }
 
 /// The reply to a request.
@@ -28,14 +35,14 @@ pub(crate) struct Reply {
 /// Where a reply goes.
 pub(crate) struct ReplyTo {
     to: oneshot::Sender<Reply>,
-    unwanted: Arc<AtomicBool>,
+    client: Arc<Client>,
 }
 
 /// A reply that comes later. An error means that the request was not sent, or that its link has ended.
 #[derive(Debug)]
 pub(crate) struct PendingReply {
     from: oneshot::Receiver<Reply>,
-    unwanted: Arc<AtomicBool>,
+    client: Arc<Client>,
 }
 
 impl ReplyTo {
@@ -51,7 +58,13 @@ impl ReplyTo {
 
     /// Whether the request need not be sent any more.
     pub(crate) fn is_unwanted(&self) -> bool {
-        self.to.is_closed() || self.unwanted.load(Ordering::Relaxed)
+        self.to.is_closed() || self.client.is_gone.load(Ordering::Relaxed)
+    }
+
+    /// Waits until the client has disconnected.
+    pub(crate) fn gone(&self) -> impl Future<Output = ()> + use<> {
+        let client = Arc::clone(&self.client);
+        async move { client.gone.notified().await }
     }
 }
 
@@ -59,7 +72,8 @@ impl PendingReply {
     /// The client has disconnected: a request that waits for its turn is not sent. The reply to one that
     /// was sent still comes, because the audit log records it.
     pub(crate) fn give_up(&self) {
-        self.unwanted.store(true, Ordering::Relaxed);
+        self.client.is_gone.store(true, Ordering::Relaxed);
+        self.client.gone.notify_one();
     }
 
     /// Blocks the calling thread until the reply comes.

@@ -73,6 +73,7 @@ impl Serving {
         let Some(reply) = self.admitted(unit_id, &request, vec![reply], &shared).pop() else {
             return;
         };
+        let client_gone = reply.client_gone();
         let joining = self.reads.join(read.clone(), reply);
         if joining.joins {
             counters.coalesced.add();
@@ -80,6 +81,10 @@ impl Serving {
         let turn = tokio::select! {
             biased;
             () = joining.sent() => return,
+            () = client_gone => {
+                joining.withdraw();
+                return counters.withdrawn.add();
+            }
             turn = self.link.turn(source, priority) => turn,
         };
         let replies = joining.leave();

@@ -106,6 +106,15 @@ impl Joining<'_> {
         self.equal.sent.notified().await;
     }
 
+    /// Its client has disconnected: its place in the queue is free, and equal reads wait without it.
+    pub(in crate::link) fn withdraw(self) {
+        self.equal.replies.borrow_mut().retain(|reply| !reply.is_unwanted());
+        let is_last = Rc::strong_count(&self.equal) == 2;
+        if let Some(read) = self.read.as_ref().filter(|_| is_last) {
+            self.reads.waiting.borrow_mut().remove(read);
+        }
+    }
+
     /// The request is sent now: later equal reads are answered by another one.
     pub(in crate::link) fn leave(self) -> Vec<Reply> {
         if let Some(read) = &self.read {
