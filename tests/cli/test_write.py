@@ -182,6 +182,20 @@ def test_a_refusal_is_told(server: holdfast.Server) -> None:
     assert (found["ok"], found["code"], found["maybe_written"]) == (False, 2, False)
 
 
+def test_a_device_without_the_function_may_have_another() -> None:
+    def multiple(pdu: bytes) -> bytes:
+        return exception(pdu, 1) if pdu[0] == 6 else pdu[:5]
+
+    with FakeDevice(multiple) as device:
+        assert failure("write", device.url, "hr", "0", "1") == [
+            f"holdfast: {device.url}: exception 01 (Illegal Function)",
+            "hint: the device lacks the function, or lets this client only read: some write one "
+            "coil or register with write_multiple=1 in the URL; if Holdfast serves it, see "
+            "'holdfast check FILE --as ADDRESS'",
+        ]
+        assert answer("write", f"{device.url}?write_multiple=1", "hr", "0", "1")["ok"] is True
+
+
 def test_silence_leaves_it_open_whether_something_was_written() -> None:
     with FakeDevice(lambda _: None) as device:
         found = answer("write", device.url, "hr", "0", "1", "--timeout", "0.05", code=1)

@@ -19,7 +19,7 @@ from holdfast.errors import (
     ModbusException,
     RequestTimeout,
 )
-from holdfast.protocol import ILLEGAL_ADDRESS, TARGET_SILENT
+from holdfast.protocol import ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, TARGET_SILENT
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -85,6 +85,11 @@ HINTS = {
 
 WRITE_HINTS = {
     **HINTS,
+    ILLEGAL_FUNCTION: (
+        "the device lacks the function, or lets this client only read: some write one coil or "
+        "register with write_multiple=1 in the URL; if Holdfast serves it, see "
+        "'holdfast check FILE --as ADDRESS'"
+    ),
     ILLEGAL_ADDRESS: (
         "the address does not exist, or may not be written; if Holdfast serves it, see "
         "'holdfast check FILE --as ADDRESS', and 'writes' of the device in FILE"
