@@ -46,6 +46,7 @@ CASES = {
     "memory verify": ("{folder}/plant.redb", "{mma}"),
     "import home-assistant": ("{home_assistant}", "{absent}"),
     "import mma": ("{mma}", "{absent}"),
+    "import modpoll": ("{modpoll} --url tcp://10.5.1.29", "{absent} --url tcp://10.5.1.29"),
     "import replicator": ("{replicator}", "{absent}"),
     "import telegraf": ("{telegraf}", "{absent}"),
     "cert show": ("{folder}/ca.pem", "{mma}"),
@@ -75,6 +76,8 @@ TELEGRAF = """\
   controller = "tcp://10.5.1.29:502"
   coils = [{name = "pump", address = [0]}]
 """
+
+MODPOLL = "device,plc,1\npoll,coil,0,8,BE_BE\nref,pump,0,bool,r\n"
 
 NO_TARGET = {"token"}
 
@@ -147,6 +150,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     (folder / "replicator.yaml").write_text(REPLICATOR)
     (folder / "home_assistant.yaml").write_text(HOME_ASSISTANT)
     (folder / "telegraf.conf").write_text(TELEGRAF)
+    (folder / "modpoll.csv").write_text(MODPOLL)
     yield {
         "mma": str(DATA / "mma" / "plant.yaml"),
         "folder": str(folder),
@@ -155,6 +159,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
         "replicator": str(folder / "replicator.yaml"),
         "home_assistant": str(folder / "home_assistant.yaml"),
         "telegraf": str(folder / "telegraf.conf"),
+        "modpoll": str(folder / "modpoll.csv"),
         "audit": str(folder / "audit.log"),
         "nats": nats.url,
     }

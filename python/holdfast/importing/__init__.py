@@ -9,11 +9,13 @@ from __future__ import annotations
 from holdfast.importing.home_assistant import read_home_assistant
 from holdfast.importing.imported import ORDINALS, Imported, NotImportable
 from holdfast.importing.mma import read_mma
+from holdfast.importing.modpoll import INTERVAL_S, read_modpoll
 from holdfast.importing.notes import Kind, Note
 from holdfast.importing.replicator import read_replicator
 from holdfast.importing.telegraf import read_telegraf
 
 __all__ = [
+    "INTERVAL_S",
     "ORDINALS",
     "Imported",
     "Kind",
@@ -21,6 +23,7 @@ __all__ = [
     "Note",
     "read_home_assistant",
     "read_mma",
+    "read_modpoll",
     "read_replicator",
     "read_telegraf",
 ]

@@ -11,8 +11,10 @@ import click
 
 from holdfast.cli import SuggestingGroup
 from holdfast.cli.exit_codes import ExitCode, fail
+from holdfast.cli.options.duration import Duration, time_option
 from holdfast.cli.options.item import areas_of
 from holdfast.cli.options.option import config_argument, flag, json_option, option, option_group
+from holdfast.cli.options.url import checked_url
 from holdfast.cli.shell_command import shell_command
 from holdfast.cli.terminal_text import (
     counted,
@@ -21,12 +23,15 @@ from holdfast.cli.terminal_text import (
     problems_to_json,
     show_problems,
 )
+from holdfast.client.base import MAX_INTERVAL_S, MIN_INTERVAL_S
 from holdfast.config import ConfigError
 from holdfast.importing import (
+    INTERVAL_S,
     ORDINALS,
     NotImportable,
     read_home_assistant,
     read_mma,
+    read_modpoll,
     read_replicator,
     read_telegraf,
 )
@@ -95,6 +100,35 @@ def mma(
         grant_mqtt=grant_mqtt or (),
     )
     _convert(read, file, output, force, as_json)
+
+
+@import_.command(
+    epilog="Example: holdfast import modpoll boiler.csv --url tcp://10.0.0.5 --output plant.yaml"
+)
+@_common
+@option(
+    "--url",
+    "URL",
+    "The devices, as --tcp, --udp or --rtu of modpoll name them.",
+    checked_url,
+    required=True,
+)
+@time_option(
+    "--interval",
+    "Time between polls, as --rate of modpoll.",
+    f"{INTERVAL_S:g}",
+    Duration(MIN_INTERVAL_S, MAX_INTERVAL_S),
+)
+def modpoll(
+    file: Path, output: Path | None, force: bool, as_json: bool, url: str, interval: float
+) -> None:
+    """Convert FILE, a CSV file of the Python program modpoll, to a Holdfast configuration.
+
+    Prints the new configuration. Notes on standard error, and comments in the configuration, say
+    what was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write
+    OUT, 2 can't import FILE.
+    """
+    _convert(lambda: read_modpoll(file, url, interval), file, output, force, as_json)
 
 
 @import_.command(epilog="Example: holdfast import replicator replicator.yaml --output mirror.yaml")

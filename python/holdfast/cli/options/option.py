@@ -32,10 +32,11 @@ def option(
 
     The help shows its default, if there is one.
     """
-    more = {"show_default": default not in (None, ""), **more}
-    return click.option(
-        *names.split(), type=type, default=default, metavar=metavar, help=help, **more
-    )
+    if (
+        default is not None
+    ):  # Click takes `None` for a default, too: it would not ask for the option.
+        more = {"default": default, "show_default": default != "", **more}
+    return click.option(*names.split(), type=type, metavar=metavar, help=help, **more)
 
 
 def flag(names: str, help: str, default: bool = False) -> Callable[[Command], Command]:
