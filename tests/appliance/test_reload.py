@@ -311,6 +311,41 @@ def test_options_in_the_url_of_a_connection_in_use_require_a_restart(
     assert reasons(link(before) | device(before), link(before) | device(before)) == []
 
 
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"queue": 7},
+        {"priority": {"10.0.0.9": "high"}},
+        {"coalesce": False},
+        {"cache": 60},
+    ],
+    ids=lambda setting: next(iter(setting)),
+)
+def test_routes_in_use_keep_the_settings_of_their_link(rig: Rig, setting: Settings) -> None:
+    url = "tcp://10.0.0.1"
+
+    def config(link: Settings | None, *routes: str) -> Config:
+        links = {} if link is None else {"links": {"line": {"url": url, **link}}}
+        units = {1: "plant", **{at: {"route": name} for at, name in enumerate(routes, 2)}}
+        found: Config = rig.load(
+            plant(
+                listeners={"scada": listener(rule("127.0.0.0/8", units=units))},
+                devices={"pump": {"url": url, "interval": 1}},
+                **links,
+            )
+        )
+        return found
+
+    alone, linked = config(None, "pump"), config(setting, "pump")
+    defaults, unrouted = config({}, "pump"), config(None)
+    for before, now in [(alone, linked), (linked, alone), (defaults, linked), (linked, defaults)]:
+        assert list(restart_reasons(before, now)) == [LINK_CHANGED]
+    for before, now in [(alone, defaults), (defaults, alone), (unrouted, linked)]:
+        assert list(restart_reasons(before, now)) == []
+    assert list(restart_reasons(linked, unrouted)) == []
+    assert list(restart_reasons(linked, config(setting))) == []
+
+
 def test_options_that_move_from_the_url_to_the_tolerance_change_nothing(rig: Rig) -> None:
     def config(url: str, **more: Any) -> Any:
         return rig.load(plant(devices={"pump": {"url": url, "interval": 1, **more}}))

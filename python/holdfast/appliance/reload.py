@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from holdfast.client.url import shared_connection, shared_options
 from holdfast.config.checks.units import routed
 from holdfast.config.fingerprint import fingerprint
+from holdfast.config.models.links import LinkConfig
 from holdfast.runtime.bounded_files import answered
 
 if TYPE_CHECKING:
@@ -14,7 +15,6 @@ if TYPE_CHECKING:
 
     from holdfast.config import Config
     from holdfast.config.models.devices import DeviceConfig
-    from holdfast.config.models.links import LinkConfig
     from holdfast.config.models.memories import MemoryConfig
 
 
@@ -33,6 +33,8 @@ class ReloadIncomplete(Exception):
 SINGLE = ("identity", "rest", "mqtt", "nats", "gateway", "metrics", "log", "reload")
 OF_ALL_PROFILES = ("nats", "gateway")
 """Services that know the tags of every profile."""
+OF_ROUTES = ("queue", "priority", "coalesce", "cache")
+"""Settings of a link that matter only for routes."""
 SEVERAL = ("memories", "listeners", "devices", "links", "outputs", "adapters")
 
 
@@ -101,18 +103,40 @@ def restart_reasons(before: Config, now: Config) -> Iterator[str]:
     # Threads and services use the audit log as it is.
     if fingerprint(before.audit) != fingerprint(now.audit):
         yield "audit: changed"
-    in_use = _connections_in_use(before)
-    links = {shared_connection(link.target): link for link in before.links.values()}
-    for name, link in now.links.items():
-        own = set(type(link).model_fields) - {"url", "timeout", "tolerance"}
-        if _is_changed(in_use, link) or _differs(
-            links.get(shared_connection(link.target)), link, own
-        ):
+    in_use, routes = _connections_in_use(before), _settings_of_routes(before)
+    changed = {
+        connection
+        for connection, settings in _settings_of_routes(now).items()
+        if routes.get(connection, settings) != settings
+    }
+    changed |= {
+        shared_connection(link.target) for link in now.links.values() if _is_changed(in_use, link)
+    }
+    links = {
+        shared_connection(link.target): name
+        for config in (before, now)
+        for name, link in config.links.items()
+    }
+    for connection, name in links.items():
+        if connection in changed:
             yield f"links.{name}: settings of a connection in use changed"
     for name, device in _deciding_devices(now):
         if _is_changed(in_use, device):
             keys = "in_flight, retry, tolerance or serial settings"
             yield f"devices.{name}: {keys} of a connection in use changed"
+
+
+def _settings_of_routes(config: Config) -> dict[tuple[str, str], list[object]]:
+    """The settings that all routes to an address share: those of its link, or the defaults."""
+    found = {
+        shared_connection(link.target): [getattr(link, key) for key in OF_ROUTES]
+        for link in config.links.values()
+    }
+    defaults = [LinkConfig.model_fields[key].default for key in OF_ROUTES]
+    for name in routed(config):
+        if name in config.devices:
+            found.setdefault(shared_connection(config.devices[name].target), defaults)
+    return found
 
 
 def _connections_in_use(config: Config) -> dict[tuple[str, str], list[object]]:
@@ -150,7 +174,3 @@ def _is_changed(
 def _layout(settings: MemoryConfig) -> object:
     areas = {area: (span.start, span.size) for area, span in settings.areas().items()}
     return areas, settings.files, settings.seal
-
-
-def _differs(before: LinkConfig | None, now: LinkConfig, keys: set[str]) -> bool:
-    return before is not None and any(getattr(before, key) != getattr(now, key) for key in keys)
