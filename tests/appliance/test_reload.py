@@ -7,6 +7,7 @@ import http.client
 import json
 import logging
 import socket
+import termios
 import threading
 import urllib.error
 import urllib.request
@@ -32,6 +33,7 @@ from support import web, wire
 from support.certificates import Certificates, Issued, named
 from support.config_folder import written
 from support.fake_device import Stream, registers, silent
+from support.lines import Terminal
 from support.routed import Held
 from support.running import endpoint, log_events
 from support.tls_peer import Peer, Refused, context
@@ -199,6 +201,28 @@ def test_an_address_in_use_leaves_everything_as_it_was(rig: Rig, connect: Connec
     assert client.ask(WRITE) == WRITE
     assert [each.name for each in rig.appliance.endpoints()] == ["scada"]
     assert list(rig.appliance.config.listeners) == ["scada"]
+
+
+def test_a_refused_reload_leaves_a_serial_line_as_it_was(rig: Rig, tmp_path: Path) -> None:
+    terminal = Terminal(tmp_path / "line")
+
+    def line(**serial: Any) -> Settings:
+        rules = [{"units": {1: "plant"}, "access": "read-write"}]
+        settings = {"device": str(terminal.device), "parity": "none", **serial}
+        return {"type": "modbus-rtu", "serial": settings, "rules": rules}
+
+    rig.start(plant(listeners={"line": line(baud=19200, stop_bits=2)}))
+    before = termios.tcgetattr(terminal.end)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        host, port = taken.getsockname()
+        other = listener(rule("127.0.0.0/8"), bind=f"{host}:{port}")
+        with pytest.raises(OSError, match=f"listener scada: can't listen on {host}:{port}"):
+            rig.reload(plant(listeners={"line": line(baud=9600, stop_bits=1), "scada": other}))
+    assert termios.tcgetattr(terminal.end) == before
+    rig.reload(plant(listeners={"line": line(baud=9600, stop_bits=1)}))
+    assert termios.tcgetattr(terminal.end) != before
+    rig.appliance.stop()
+    terminal.close()
 
 
 def test_another_framing_ends_the_connections(rig: Rig, connect: Connect) -> None:

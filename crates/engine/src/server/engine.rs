@@ -214,7 +214,9 @@ impl Engine {
             changes.push(match kept {
                 Some(kept) => kept,
                 None => {
-                    let (listener, task) = self.listener(&name, kind, identity()?, &mut sockets)?;
+                    let (listener, task) = self
+                        .listener(&name, kind, identity()?, &mut sockets)
+                        .inspect_err(|_| self.set_modes_again(&listeners))?;
                     Change::Start(Arc::new(listener), task)
                 }
             });
@@ -239,6 +241,18 @@ impl Engine {
             }
         }
         Ok(())
+    }
+
+    /// Gives serial lines the modes of the listeners that run: one that opened a line beside them before the
+    /// reload failed has set its own.
+    fn set_modes_again(&self, listeners: &[Arc<Listener>]) {
+        let _runtime = self.handles[0].enter();
+        for listener in listeners {
+            if let Served::Serial(line, ..) = &listener.served {
+                // A line that is lost gets its mode when it is back.
+                let _ = line.open();
+            }
+        }
     }
 
     /// Binds a listener, or takes over the socket of an ending one. Nothing is served before its task
