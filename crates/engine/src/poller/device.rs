@@ -692,7 +692,7 @@ impl Device {
         for forward in &self.forwards {
             let count = u16::try_from(read.count).ok().and_then(NonZeroU16::new);
             let count = count.expect("a read that is forwarded fits a packet");
-            forward.offer(index, area, address, count, bytes);
+            forward.offer(area, address, count, bytes);
         }
     }
 

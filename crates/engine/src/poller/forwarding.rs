@@ -58,10 +58,11 @@ impl ForwardSettings {
     }
 }
 
-/// What a packet has: a read, by its index, or the status block.
+/// What a packet has: a read, by its area, first address and count, or the status block. After a reload,
+/// the index of a read may be that of another one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 enum Content {
-    Read(usize),
+    Read(Area, u16, NonZeroU16),
     Status,
 }
 
@@ -169,19 +170,13 @@ impl Forward {
     }
 
     /// Queues the bytes of a read, in place of older ones. Never waits.
-    pub(super) fn offer(
-        &self,
-        read: usize,
-        area: Area,
-        address: u16,
-        count: NonZeroU16,
-        bytes: &[u8],
-    ) {
+    pub(super) fn offer(&self, area: Area, address: u16, count: NonZeroU16, bytes: &[u8]) {
+        let read = Content::Read(area, address, count);
         let address = self.settings.address(area, address);
         let address = address.expect("offsets are checked when the device is made");
         let area = in_packet(area).expect(NO_FILES);
         let header = Header { area, target: self.settings.target, address, count };
-        self.queue(Content::Read(read), &header, bytes);
+        self.queue(read, &header, bytes);
     }
 
     /// Whether the receiver gets the status block.
@@ -387,7 +382,7 @@ mod tests {
     }
 
     fn offer(forward: &Forward, value: u8) {
-        forward.offer(0, AREA, 0, NonZeroU16::MIN, &[0, value]);
+        forward.offer(AREA, 0, NonZeroU16::MIN, &[0, value]);
     }
 
     /// Reads a packet with one register. Returns the low byte of its value.
@@ -445,9 +440,21 @@ mod tests {
     }
 
     #[test]
+    fn a_reload_that_leaves_out_a_read_does_not_put_newer_bytes_before_older_ones() {
+        let forward = Forward::new(ForwardSettings::for_tests(1, None), Arc::default(), None);
+        let offer = |address, value| forward.offer(AREA, address, NonZeroU16::MIN, &[0, value]);
+        offer(0, 1);
+        offer(10, 2);
+        offer(10, 3);
+        let mut waiting = forward.waiting.take();
+        let packets = std::iter::from_fn(|| waiting.take());
+        assert_eq!(packets.map(|(_, packet)| packet[packet.len() - 1]).collect::<Vec<_>>(), [1, 3]);
+    }
+
+    #[test]
     fn reads_take_turns_and_newer_bytes_replace_older_ones() {
         let mut waiting = Waiting::default();
-        let (first, second) = (Content::Read(0), Content::Status);
+        let (first, second) = (Content::Read(AREA, 0, NonZeroU16::MIN), Content::Status);
         assert!(!waiting.put(first, vec![1]) && !waiting.put(second, vec![2]));
         let (of, packet) = waiting.take().unwrap();
         assert_eq!((of, &packet[..]), (first, &[1][..]));
