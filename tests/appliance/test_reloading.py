@@ -329,3 +329,17 @@ def test_who_waits_for_a_reload_is_answered_when_the_appliance_stops(tmp_path: P
     assert answers == [{"problems": [f"{plant.file}: the appliance has stopped"]}]
     with plant.file.open("w") as writer:
         writer.write(HEAD)
+
+
+def test_a_reload_raises_the_limit_on_open_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raised: list[tuple[int, int]] = []
+    monkeypatch.setattr("resource.getrlimit", lambda _: (1000, 100_000))
+    monkeypatch.setattr("resource.setrlimit", lambda _, limits: raised.append(limits))
+    plant = Plant(tmp_path)
+    plant.file.write_text(HEAD + MORE + "    max_connections: 5000\n")
+    assert "problems" not in plant.request()
+    [(soft, hard)] = raised
+    assert soft > 5000
+    assert hard == 100_000

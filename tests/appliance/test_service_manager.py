@@ -225,7 +225,7 @@ def test_a_stalled_thread_starves_the_watchdog(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(command, "Appliance", Appliance)
     monkeypatch.setattr(command, "Signals", Signals)
     monkeypatch.setattr(command, "ServiceManager", Recorder)
-    for skipped in ("raise_open_file_limit", "_connections", "yield_interpreter"):
+    for skipped in ("allow_open_files", "yield_interpreter"):
         monkeypatch.setattr(command, skipped, lambda *_: 0)
     monkeypatch.setattr(command, "spare_what_stays", lambda: steps.append("freeze"))
     monkeypatch.setattr("holdfast.events.log_lines.configure", lambda *_: None)

@@ -237,6 +237,9 @@ pub(crate) fn event_fields<'py>(py: Python<'py>, event: &Event) -> PyResult<Boun
     if event.count > 1 {
         fields.set_item("count", event.count)?;
     }
+    if let Some(error) = event.kind.error() {
+        fields.set_item("error", error)?;
+    }
     if let Some(reason) = event.kind.reason() {
         fields.set_item("reason", reason)?;
     }

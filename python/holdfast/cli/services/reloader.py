@@ -16,6 +16,7 @@ import click
 from holdfast.adapters.plugins import UnknownAdapter
 from holdfast.appliance.reload import ReloadIncomplete, ReloadRefused, described
 from holdfast.cli.services.file_snapshot import FileSnapshot
+from holdfast.cli.services.open_files import allow_open_files
 from holdfast.cli.shell_command import shell_command
 from holdfast.config import ConfigError
 from holdfast.config.fingerprint import files_of
@@ -204,6 +205,7 @@ class Reloader:
             assert read.config is not None, "without an error, there is a configuration"
             config = read.config
             before = self._appliance.config
+            allow_open_files(config, self._file)
             changed = self._appliance.reload(config)
         except ConfigError as error:
             problems = [str(problem) for problem in error.problems]

@@ -18,18 +18,16 @@ from holdfast.appliance import Appliance
 from holdfast.appliance.control import Control
 from holdfast.appliance.parts.shared_logs import LogNotJoined
 from holdfast.appliance.service_manager import ServiceManager
-from holdfast.appliance.services.gateway import gateway_settings
-from holdfast.appliance.services.scanner import scanner_settings
 from holdfast.cli import standard_output
 from holdfast.cli.configuration import load_or_exit, load_whole
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import config_argument
 from holdfast.cli.options.plc_addresses import MODICON_AREAS
+from holdfast.cli.services.open_files import allow_open_files
 from holdfast.cli.services.reloader import Reloader
 from holdfast.cli.shell_command import shell_command
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Interrupted, Signals
 from holdfast.cli.terminal_text import ranges_shown
-from holdfast.config.fingerprint import files_of
 from holdfast.config.models.listeners import ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from holdfast.config.models.services import GatewayConfig
 from holdfast.config.unit_rights import unit_rights
@@ -54,10 +52,6 @@ if TYPE_CHECKING:
     from holdfast.config.models.services import NatsConfig
     from holdfast.config.unit_rights import UnitRights
     from holdfast.types import Area
-
-# A signal is noticed within this time.
-OTHER_FILES = 128
-"""Open files that are not connections: listeners, metrics requests, the interpreter's files."""
 
 # Who ends a connection at a request of `holdfast sessions`, in the audit log.
 SOURCE = {"source": "holdfast sessions"}
@@ -105,7 +99,7 @@ def serve(
     """
     log_lines.configure(config.log.level, config.log.format)
     yield_interpreter()
-    raise_open_file_limit(_connections(config) + _watched(config, file))
+    allow_open_files(config, file)
     signals = control or Signals(
         reload="always" if file else "with a terminal" if load else "never"
     )
@@ -166,47 +160,6 @@ def _control(appliance: Appliance, reloading: Reloader, file: Path) -> Callable[
     except OSError as error:
         log_lines.write(logging.WARNING, "control_unavailable", reason=str(error))
         return lambda: None
-
-
-def _connections(config: Config) -> int:
-    """The maximum number of open connections of a configuration."""
-    served = [*config.listeners.values(), config.rest]
-    limits = ("max_connections", "max_handshakes")
-    most = sum(getattr(each, limit, 0) or 0 for each in served for limit in limits)
-    most += sum(1 + len(device.forward) for device in config.devices.values())
-    most += len(config.links)
-    if config.nats is not None:
-        most += scanner_settings(config.nats).limits.devices
-    if config.gateway is not None:
-        of_gateway = gateway_settings(config.gateway).limits
-        most += of_gateway.connections + of_gateway.devices
-    return most
-
-
-def raise_open_file_limit(connections: int) -> None:
-    """Raises the limit on open files for `connections`; logs if the system does not allow it."""
-    try:
-        import resource
-    except ImportError:  # Windows has no such limit.
-        return
-    needed = connections + OTHER_FILES
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft == resource.RLIM_INFINITY or soft >= needed:
-        return
-    allowed = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
-    try:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
-    except (ValueError, OSError):  # The system has a lower limit that it does not report.
-        allowed = soft
-    if allowed < needed:
-        log_lines.write(logging.WARNING, "too_few_open_files", needed=needed, allowed=allowed)
-
-
-def _watched(config: Config, file: Path | None) -> int:
-    """The number of files that are kept open while they are watched."""
-    if file is None or config.reload != "on-change":
-        return 0
-    return len(files_of(file, config))
 
 
 def _greeting(appliance: Appliance, file: Path) -> str:

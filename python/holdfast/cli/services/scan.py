@@ -28,7 +28,7 @@ from holdfast.cli.options.option import (
     schema_option,
 )
 from holdfast.cli.options.tls import DEVICES, tls_options
-from holdfast.cli.services.run import raise_open_file_limit
+from holdfast.cli.services.open_files import raise_open_file_limit
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.config.fingerprint import fingerprint
 from holdfast.config.values.scanner_settings import (

@@ -289,9 +289,9 @@ pub(crate) async fn accept<S: Service>(
         match accepted {
             Ok((stream, peer)) => admit(&context, &service, stream, peer, &workers, &stop),
             Err(error) if is_of_one_peer(&error) => {}
-            Err(_) => {
+            Err(error) => {
                 context.connections.accept_errors.add();
-                context.report(Kind::AcceptError, None);
+                context.report(Kind::AcceptError(error.raw_os_error()), None);
                 tokio::time::sleep(ACCEPT_PAUSE).await;
             }
         }

@@ -6,6 +6,7 @@
 //! other events have half of the queue.
 
 use std::collections::{HashMap, VecDeque};
+use std::io;
 use std::net::{IpAddr, Ipv6Addr};
 use std::sync::atomic::{AtomicU8, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -58,7 +59,8 @@ pub enum Kind {
     RefusedRequest(RefusedRequest),
     /// TLS failed, usually in the handshake. The reason is a word for programs.
     TlsFailed(&'static str),
-    AcceptError,
+    /// The number is that of the error of the system.
+    AcceptError(Option<i32>),
     /// A Raw Ingest packet was not written.
     PacketRefused(Refusal),
     /// This many bytes followed the only Raw Ingest packet of a connection, which was written.
@@ -102,7 +104,7 @@ impl Kind {
             Kind::RefusedListenOnly => "refused_listen_only",
             Kind::RefusedRequest(refused) => refused.why.name(),
             Kind::TlsFailed(_) => "tls_failed",
-            Kind::AcceptError => "accept_error",
+            Kind::AcceptError(_) => "accept_error",
             Kind::PacketRefused(_) => "packet_refused",
             Kind::SurplusBytes(_) => "surplus_bytes",
             Kind::BytesDropped(_) => "bytes_dropped",
@@ -117,6 +119,14 @@ impl Kind {
             Kind::PacketRefused(refusal) => Some(refusal.name()),
             Kind::TlsFailed(reason) => Some(reason),
             Kind::EvictedHandshake => Some("handshake"),
+            _ => None,
+        }
+    }
+
+    /// The error of the system, for people.
+    pub fn error(self) -> Option<String> {
+        match self {
+            Kind::AcceptError(code) => Some(io::Error::from_raw_os_error(code?).to_string()),
             _ => None,
         }
     }
@@ -327,6 +337,14 @@ mod tests {
         let (began, timeout) = (Instant::now(), Duration::from_millis(20));
         assert_eq!(events.next(timeout), None);
         assert!(began.elapsed() >= timeout);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_connection_that_is_not_accepted_has_the_error_of_the_system() {
+        let error = Kind::AcceptError(Some(24)).error();
+        assert_eq!(error.unwrap(), "Too many open files (os error 24)");
+        assert_eq!(Kind::Closed.error(), None);
     }
 
     /// The `port`-th connection of a source, refused.
