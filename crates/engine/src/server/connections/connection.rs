@@ -352,6 +352,8 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
 
     /// Discards the beginning of a request that nothing followed, or ends the connection.
     fn on_alarm(&mut self) -> Result<(), Kind> {
+        // The alarm may be that of a timeout which a reload has changed.
+        self.renew()?;
         let now = Instant::now();
         match self.deadlines.expired(now, self.exchange()) {
             Expired::Nothing => {}
@@ -856,6 +858,30 @@ mod tests {
         drop(other);
         assert!(connection.poll(&mut context).is_pending(), "nothing has arrived");
         assert_eq!(connection.on_alarm(), Err(Kind::RequestTimeout));
+    }
+
+    struct WithoutLimit(Arc<PeerRights>);
+
+    impl Renewal for WithoutLimit {
+        fn terms(&self, _peer: &Peer) -> Option<Terms> {
+            let timeouts = Timeouts { idle: None, request: Duration::ZERO, frame: None };
+            Some(Terms { rights: Arc::clone(&self.0), timeouts })
+        }
+    }
+
+    #[test]
+    fn an_idle_timeout_that_a_reload_has_removed_ends_no_connection() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let _guard = runtime.enter();
+        let (mut connection, _bound) = connection::<Mbap>();
+        let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
+        let admission = Arc::new(Admission::new(limits));
+        connection.ticket = admission.admit(SocketAddr::from(([192, 0, 2, 1], 1))).unwrap().0;
+        connection.renewal = Arc::new(WithoutLimit(Arc::clone(&connection.answering.rights)));
+        connection.deadlines.timeouts.idle = Some(Duration::ZERO);
+        assert_eq!(connection.on_alarm(), Err(Kind::Idle));
+        admission.review(|_| None::<Kind>);
+        assert_eq!(connection.on_alarm(), Ok(()));
     }
 
     #[test]
