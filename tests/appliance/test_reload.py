@@ -851,6 +851,40 @@ def test_a_token_has_its_new_rights_before_the_next_request(
             assert asked(line) == refused
 
 
+def test_a_new_memory_ends_no_stream_of_a_token(rig: Rig) -> None:
+    def settings(*granted: str, **more: Settings) -> Settings:
+        token = web.token("hmi", "secret", memories=granted)
+        rest = {"bind": "127.0.0.1:0", "sources": ["127.0.0.1"], "tokens": [token]}
+        return plant(memories={**plant()["memories"], **more}, rest=rest)
+
+    rig.start(settings("plant"))
+    wire.until(lambda: answers(rig), "REST answers")
+    path = "/api/v1/memory/changes?memory=plant&area=holding_registers&address=7&count=1"
+    request = web.head("GET", path, "Authorization: Bearer secret", "Accept: text/event-stream")
+    with socket.create_connection(rig.address("rest"), wire.DEADLINE) as line:
+        line.sendall(request)
+        stream = line.makefile("rb")
+        assert any(b"[0]" in received for received in stream)
+        assert rig.reload(settings("plant", more={"coils": 8})) == ["memories.more"]
+        rig.appliance.memories["plant"].write("holding_registers", 7, [42])
+        assert any(b"[42]" in received for received in stream), "the stream goes on"
+    rig.reload(settings("plant", "more", more={"coils": 8}))
+    wire.until(lambda: answers(rig), "REST answers again")
+    client = web.Client(rig.address("rest"), "secret")
+    assert client.read("coils", 0, 1, "more").status == 200
+    client.close()
+
+
+def test_a_new_memory_may_be_read_by_everyone_without_tokens(rig: Rig) -> None:
+    rest = {"bind": "127.0.0.1:0", "sources": ["127.0.0.1"], "tokens": "none"}
+    rig.start(plant(rest=rest))
+    rig.reload(plant(memories={**plant()["memories"], "more": {"coils": 8}}, rest=rest))
+    wire.until(lambda: answers(rig), "REST answers")
+    client = web.Client(rig.address("rest"))
+    assert client.read("coils", 0, 1, "more").status == 200
+    client.close()
+
+
 def test_an_http_address_in_use_is_refused(rig: Rig, connect: Connect) -> None:
     rig.start(plant())
     with socket.create_server(("127.0.0.1", 0)) as taken:

@@ -34,7 +34,8 @@ class RestService(Service):
                 settings, access, of.diagnostics, of.sessions, at.port.listener, https=at.https
             ),
             *at.restart_settings,
-            sorted(of.memories),
+            # Without tokens, everyone may read all memories. A token names its own.
+            sorted(of.memories) if settings.tokens == "none" else (),
             access=access,
             port=at.port,
         )
