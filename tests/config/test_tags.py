@@ -118,6 +118,10 @@ def test_a_scale_can_be_in_a_register(tmp_path: Path) -> None:
             "from: type 'int13' is unknown, allowed: ",
         ),
         (
+            "{from: {area: input_registers, address: 1, type: ''}, as: factor}",
+            "from: type: found '', allowed: a type, such as uint16",
+        ),
+        (
             "{from: {area: holding_registers, address: 1}, as: factor}",
             "the scale is from holding_registers 1, allowed: a register in input_registers, as the",
         ),
@@ -299,6 +303,11 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
         ("t.csv", "", "t.csv:1: tags: "),
         ("t.yaml", "- a\n", "t.yaml:1: found a list, allowed: a mapping with the keys order"),
         ("t.yaml", "tags: {a: {area: coils}}\n", "t.yaml:1: tags.a.address: missing"),
+        (
+            "t.yaml",
+            "tags: {a: {area: coils, address: 1, type: ''}}\n",
+            "t.yaml:1: tags.a.type: found '', allowed: a type, such as float32",
+        ),
         (
             "t.yaml",
             "order: A\ntags: {a: {area: input_registers, address: 1}}\n",

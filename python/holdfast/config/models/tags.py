@@ -37,6 +37,12 @@ Scale = Annotated[
 ]
 
 
+def _not_empty(value: str) -> str:
+    if not value:
+        raise ValueError("found '', allowed: a type, such as float32")
+    return value
+
+
 def _one_line(value: str) -> str:
     if any(unicodedata.category(each) == "Cc" for each in value):
         raise ValueError(f"found {show(value)}, allowed: text without control characters")
@@ -53,7 +59,7 @@ class TagConfig(Model):
     """The area."""
     address: Register
     """The first address, as in the protocol: counted from 0."""
-    type: str = ""
+    type: Annotated[Annotated[str, AfterValidator(_not_empty)] | None, NotNull()] = None
     """The type, such as float32, bit:3 or string:20. Default: bool or uint16, by area."""
     order: Annotated[str | None, NotNull()] = None
     """The byte order: ABCD, DCBA, BADC or CDAB. Default: that of the profile, or ABCD."""
@@ -86,7 +92,7 @@ class TagConfig(Model):
     def tag(self, name: str, order: str) -> Tag:
         """The tag, with a default order. Raises `TagError`."""
         settings: dict[str, Any] = {key: getattr(self, key) for key in _KEYS}
-        settings["type"] = self.type.lower()
+        settings["type"] = (self.type or "").lower()
         order = (self.order or order).upper()
         if INVALID in (*self.null, *self.states.values()):
             raise InvalidValue

@@ -98,7 +98,7 @@ def _place(source: dict[Any, Any], kind: str) -> tuple[Area, int, str]:
     if type(address) is not int or not 0 <= address <= LAST_ADDRESS:
         words = f"an integer from 0 to {LAST_ADDRESS}"
         raise ValueError(f"from: address: found {show(address)}, allowed: {words}")
-    if not isinstance(given, str):
+    if not isinstance(given, str) or not given:
         raise ValueError(f"from: type: found {show(given)}, allowed: a type, such as {kind}")
     return area, address, given
 
