@@ -1,4 +1,4 @@
-//! Writes that are passed on to a device, before a memory whose journal is slow.
+//! Writes that are passed on to a device: before a memory whose journal is slow, and during a reload.
 
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener};
@@ -10,7 +10,9 @@ use std::time::Duration;
 use holdfast_engine::client::Place;
 use holdfast_engine::link::InFlight;
 use holdfast_engine::poller::plan::{PlanLimits, Strategy};
-use holdfast_engine::poller::{DeviceSettings, Passage, PassedRange, Poller};
+use holdfast_engine::poller::{
+    Destination, DeviceSettings, Passage, PassedRange, Poller, ReadSettings,
+};
 use holdfast_memory::{Access, Area, Done, Journal, Layout, Memory, Read, Span, Step};
 use holdfast_protocol::pdu::Request;
 use holdfast_runtime::Retry;
@@ -42,22 +44,35 @@ fn register(memory: &Memory) -> [u8; 2] {
     out
 }
 
-/// A device that repeats what it receives, as the reply to function 6 does.
-fn device() -> SocketAddr {
+/// Two units. The first keeps what is written to register 3; all other registers are 0. `before_write` is
+/// called before function 6 is answered.
+fn device(before_write: impl Fn() + Send + 'static) -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();
     thread::spawn(move || {
         let (mut stream, _) = listener.accept().unwrap();
-        let mut request = [0; 12];
+        let (mut request, mut value) = ([0; 12], [0; 2]);
         while stream.read_exact(&mut request).is_ok() {
-            stream.write_all(&request).unwrap();
+            if request[7] == 6 {
+                before_write();
+                value.copy_from_slice(&request[10..]);
+                stream.write_all(&request).unwrap();
+            } else {
+                let [high, low, .., unit_id, _, _, _, _, _] = request;
+                let mut reply = [0; 19];
+                reply[..9].copy_from_slice(&[high, low, 0, 0, 0, 13, unit_id, 3, 10]);
+                if unit_id == 1 {
+                    reply[15..17].copy_from_slice(&value);
+                }
+                stream.write_all(&reply).unwrap();
+            }
         }
     });
     address
 }
 
-/// A device without reads.
-fn settings(name: &str, address: SocketAddr) -> DeviceSettings {
+/// A device that is read into the start of a memory.
+fn settings(name: &str, address: SocketAddr, memory: &Arc<Memory>) -> DeviceSettings {
     let (host, port) = ("127.0.0.1".to_owned(), address.port());
     DeviceSettings {
         name: name.into(),
@@ -67,7 +82,13 @@ fn settings(name: &str, address: SocketAddr) -> DeviceSettings {
         unit_id: 1,
         interval: Duration::from_secs(3600),
         timeout: TIMEOUT,
-        reads: Vec::new(),
+        reads: vec![ReadSettings {
+            area: AREA,
+            address: 0,
+            count: 5,
+            into: Some(Destination { memory: Arc::clone(memory), area: AREA, address: 0 }),
+            forward: false,
+        }],
         limits: PlanLimits::default(),
         strategy: Strategy::Gap { max_gap: 0 },
         measured: false,
@@ -78,6 +99,19 @@ fn settings(name: &str, address: SocketAddr) -> DeviceSettings {
         release: false,
         fence: None,
     }
+}
+
+/// Passes writes into the start of a memory on to a device.
+fn passage(poller: &Poller, device: &str, memory: &Arc<Memory>) -> Passage {
+    let range = PassedRange {
+        area: AREA,
+        address: 0,
+        count: 5,
+        device: device.into(),
+        device_address: 0,
+        emulate: false,
+    };
+    poller.passage(Arc::clone(memory), vec![range]).unwrap()
 }
 
 /// Writes register 3 in a thread of its own.
@@ -92,31 +126,73 @@ fn written(passage: Passage) -> Receiver<Result<(), u8>> {
 
 #[test]
 fn a_journal_that_is_slow_holds_up_no_other_device() {
-    let devices = ["slow", "other"].map(|name| settings(name, device()));
-    let poller = Poller::start(devices.to_vec()).unwrap();
-    let passage = |device: &str, memory: &Arc<Memory>| {
-        let range = PassedRange {
-            area: AREA,
-            address: 0,
-            count: 10,
-            device: device.into(),
-            device_address: 0,
-            emulate: false,
-        };
-        poller.passage(Arc::clone(memory), vec![range]).unwrap()
-    };
     let (kept, volatile) = (memory(), memory());
     let (sender, steps) = channel();
     kept.keep_in(Arc::new(Manual(Mutex::new(sender))), 0);
+    let slow = settings("slow", device(|| ()), &kept);
+    let other = settings("other", device(|| ()), &volatile);
+    let poller = Poller::start(vec![slow, other]).unwrap();
+    let carry_out = |Waiting(step, done): Waiting| {
+        done(Ok(step.carry_out(std::slice::from_ref(&kept)).unwrap()));
+    };
+    carry_out(steps.recv_timeout(TIMEOUT).expect("the journal has the first poll"));
 
-    let slow = written(passage("slow", &kept));
-    let Waiting(step, done) = steps.recv_timeout(TIMEOUT).expect("the journal has the write");
-    let other = written(passage("other", &volatile));
+    let slow = written(passage(&poller, "slow", &kept));
+    let step = steps.recv_timeout(TIMEOUT).expect("the journal has the write");
+    let other = written(passage(&poller, "other", &volatile));
     assert_eq!(other.recv_timeout(TIMEOUT), Ok(Ok(())));
     assert_eq!(register(&volatile), [0, 7]);
     assert!(slow.try_recv().is_err(), "it is not stored yet");
 
-    done(Ok(step.carry_out(std::slice::from_ref(&kept)).unwrap()));
+    carry_out(step);
     assert_eq!(slow.recv_timeout(TIMEOUT), Ok(Ok(())));
     assert_eq!(register(&kept), [0, 7]);
+}
+
+/// What changes in a device while a write to it is under way.
+fn assert_not_stored_after(change: impl FnOnce(&Poller, DeviceSettings)) {
+    let memory = memory();
+    let (sender, asked) = channel();
+    let (answers, answer) = channel();
+    let address = device(move || {
+        sender.send(()).unwrap();
+        answer.recv_timeout(TIMEOUT).unwrap();
+    });
+    let settings = settings("meter", address, &memory);
+    let poller = Poller::start(vec![settings.clone()]).unwrap();
+    let outcome = written(passage(&poller, "meter", &memory));
+    asked.recv_timeout(TIMEOUT).expect("the device has the write");
+
+    change(&poller, settings);
+    // It is refused after the thread of the poller has made the change.
+    let unknown = passage(&poller, "unknown", &memory);
+    assert_eq!(written(unknown).recv_timeout(TIMEOUT), Ok(Err(0x0A)));
+    answers.send(()).unwrap();
+    assert_eq!(outcome.recv_timeout(TIMEOUT), Ok(Err(0x0B)));
+    assert_eq!(register(&memory), [0, 0]);
+}
+
+#[test]
+fn a_write_is_not_stored_where_its_device_is_no_longer_read_into() {
+    assert_not_stored_after(|poller, mut settings| {
+        settings.reads[0].into.as_mut().unwrap().address = 5;
+        poller.replace("meter", settings, false).unwrap();
+    });
+    assert_not_stored_after(|poller, mut settings| {
+        settings.unit_id = 2;
+        poller.replace("meter", settings, false).unwrap();
+    });
+    assert_not_stored_after(|poller, _| assert!(poller.remove("meter")));
+}
+
+#[test]
+fn a_write_to_a_range_that_has_moved_is_not_sent() {
+    let memory = memory();
+    let settings = settings("meter", device(|| panic!("it was sent")), &memory);
+    let poller = Poller::start(vec![settings.clone()]).unwrap();
+    let before = passage(&poller, "meter", &memory);
+    let mut moved = settings;
+    moved.reads[0].into.as_mut().unwrap().address = 5;
+    poller.replace("meter", moved, false).unwrap();
+    assert_eq!(written(before).recv_timeout(TIMEOUT), Ok(Err(0x0A)));
 }

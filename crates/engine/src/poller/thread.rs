@@ -1,5 +1,6 @@
 //! Runs all devices on one thread. Devices can be added and removed, and are stopped together.
 
+use std::cell::RefCell;
 use std::collections::HashMap;
 use std::io;
 use std::net::IpAddr;
@@ -17,7 +18,7 @@ use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
-use super::device::{Device, DeviceSettings, Inbox, Planned};
+use super::device::{Device, DeviceSettings, Inbox, Planned, ReadSettings};
 use super::forwarding::{Forward, ForwardCounters, ForwardSettings};
 use super::panic_guard::spawn_guarded;
 use super::plan::{PlanError, PlanLimits};
@@ -384,6 +385,9 @@ struct Running {
     timeout: Duration,
     release: bool,
     fence: Option<Arc<Fence>>,
+    /// What is read from it now. Writes that are under way look here, and see nothing once their device
+    /// is gone.
+    reads: Rc<RefCell<Vec<ReadSettings>>>,
     inbox: Rc<Inbox>,
     device: AbortHandle,
     forwards: Vec<RunningForward>,
@@ -391,6 +395,7 @@ struct Running {
 
 impl Drop for Running {
     fn drop(&mut self) {
+        self.reads.take();
         self.device.abort();
     }
 }
@@ -523,12 +528,13 @@ impl Running {
         let inbox = Rc::new(Inbox::default());
         let DeviceSettings { unit_id, timeout, release, .. } = planned.settings;
         let fence = planned.settings.fence.clone();
+        let reads = Rc::new(RefCell::new(planned.settings.reads.clone()));
         let turn = Rc::new(Turn::default());
         let to = (Rc::clone(&link), Rc::clone(&turn));
         let state = Arc::clone(&polled.state);
         let (device, forwards) = made(planned, polled, to, Vec::new());
         let device = spawn_guarded(device.run(phase, Rc::clone(&inbox)), state);
-        Running { link, turn, unit_id, timeout, release, fence, inbox, device, forwards }
+        Running { link, turn, unit_id, timeout, release, fence, reads, inbox, device, forwards }
     }
 
     /// Whether the task of the device has panicked. It does not end otherwise.
@@ -538,6 +544,12 @@ impl Running {
 
     fn replace(&mut self, planned: Planned, polled: Polled, link: Rc<Link>, at_once: bool) {
         let settings = &planned.settings;
+        if !Rc::ptr_eq(&self.link, &link) || self.unit_id != settings.unit_id {
+            // Another device: writes that are under way are not its own.
+            self.reads.take();
+            self.reads = Rc::default();
+        }
+        self.reads.borrow_mut().clone_from(&settings.reads);
         (self.unit_id, self.timeout) = (settings.unit_id, settings.timeout);
         (self.release, self.link) = (settings.release, Rc::clone(&link));
         self.fence.clone_from(&settings.fence);
@@ -586,7 +598,7 @@ impl Running {
     /// Carries out a write of a Modbus client, between two reads.
     fn pass(&self, write: PassedWrite) {
         let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
-        let inbox = Rc::clone(&self.inbox);
+        let (inbox, reads) = (Rc::clone(&self.inbox), Rc::clone(&self.reads));
         let Running { unit_id, timeout, release, .. } = *self;
         let permit = Permit { fence: self.fence.clone(), until: None };
         spawn_local(async move {
@@ -594,7 +606,7 @@ impl Running {
             let Some(taken) = turn.take_to_write(fence, timeout).await else {
                 return write.refuse(ExceptionCode::GatewayPathUnavailable);
             };
-            let changes = write.carry_out(&link, unit_id, timeout, &permit).await;
+            let changes = write.carry_out((&link, unit_id, &reads), timeout, &permit).await;
             if !changes.is_empty() {
                 inbox.wake();
             }

@@ -4,6 +4,7 @@
 //! the device; the client gets the device's answer. When the device has confirmed it, the memory holds
 //! the new value before the client has its reply.
 
+use std::cell::RefCell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Duration;
@@ -12,6 +13,7 @@ use holdfast_memory::{Access, Area, Memory, Outcome, Refusal, Write};
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, Function, Range, Request};
 use tokio::sync::{mpsc, oneshot};
 
+use super::device::ReadSettings;
 use crate::client::ClientError;
 use crate::items::{Items, touched};
 use crate::link::{
@@ -233,15 +235,14 @@ impl PassedWrite {
     /// function 23 has read.
     pub(super) async fn carry_out(
         self,
-        link: &Link,
-        unit_id: u8,
+        (link, unit_id, reads): (&Link, u8, &RefCell<Vec<ReadSettings>>),
         timeout: Duration,
         permit: &Permit,
     ) -> Vec<Change> {
         if !self.reply.is_next() {
             return Vec::new();
         }
-        if link.retry_at().is_some() {
+        if link.retry_at().is_some() || !self.is_mirrored(reads) {
             self.refuse(ExceptionCode::GatewayPathUnavailable);
             return Vec::new();
         }
@@ -284,7 +285,7 @@ impl PassedWrite {
             None => call(&self.request).await,
         };
         let pdu = match answered {
-            Ok(answer) => return self.confirm(&answer, value, permit).await,
+            Ok(answer) => return self.confirm(&answer, value, reads, permit).await,
             Err(fault) => exception(&self.pdu, fault.exception()),
         };
         self.reply.send(pdu);
@@ -293,7 +294,13 @@ impl PassedWrite {
 
     /// Takes what the device has confirmed into memory, then replies. `value` is what the device holds
     /// after function 22.
-    async fn confirm(self, answer: &[u8], value: Option<u16>, permit: &Permit) -> Vec<Change> {
+    async fn confirm(
+        self,
+        answer: &[u8],
+        value: Option<u16>,
+        reads: &RefCell<Vec<ReadSettings>>,
+        permit: &Permit,
+    ) -> Vec<Change> {
         let mut changes: Vec<Change> = self.change(value).into_iter().collect();
         if let Ok(Request::ReadWriteMultipleRegisters { read, .. }) = Request::parse(&self.pdu)
             && let Some(bytes) = answer.get(2..)
@@ -304,7 +311,8 @@ impl PassedWrite {
         }
         let mut is_stored = true;
         for change in &changes {
-            is_stored &= self.store(change, permit.fence.as_ref()).await;
+            // A reload may have given the range to another device meanwhile.
+            is_stored &= self.is_mirrored(reads) && self.store(change, permit.fence.as_ref()).await;
         }
         let reply = match Function::from_pdu(&self.pdu) {
             // What memory can't show is not confirmed, although the device has carried it out.
@@ -316,6 +324,18 @@ impl PassedWrite {
         };
         self.reply.send(reply);
         changes
+    }
+
+    /// Whether the range still is what is read from the device.
+    fn is_mirrored(&self, reads: &RefCell<Vec<ReadSettings>>) -> bool {
+        let PassedRange { area, address, count, device_address, .. } = self.range;
+        reads.borrow().iter().any(|read| {
+            let here = (read.area, read.address, read.count) == (area, device_address, count);
+            here && read.into.as_ref().is_some_and(|into| {
+                Arc::ptr_eq(&into.memory, &self.memory)
+                    && (into.area, into.address) == (area, address)
+            })
+        })
     }
 
     /// What the device has taken over.
