@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -17,7 +18,7 @@ from support.fake_device import FakeDevice, Serial, Stream, Udp, exception, good
 from support.lines import ASCII, RTU, Line, Mode
 from support.routed import Held, await_count, configuration, counters
 from support.running import endpoint
-from support.transports import Datagrams, FramedConnection, client
+from support.transports import TRANSPORTS, Client, Datagrams, FramedConnection, client
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 READ = bytes.fromhex("0300050001")
 FIVE = bytes.fromhex("03020005")
+SIXTH = bytes.fromhex("0300060001")
+SIX = bytes.fromhex("03020006")
 WRITE = bytes.fromhex("0600051234")
 VENDOR = bytes.fromhex("4101020304")
 
@@ -77,6 +80,11 @@ def meter(device: Stream, run: Run) -> Appliance:
 
 def scada(appliance: Appliance) -> tuple[str, int]:
     return endpoint(appliance, "scada")
+
+
+def pauses(front: Client) -> bool:
+    """Waits until the next request counts as sent after a pause. Returns whether no reply came."""
+    return not select.select([front.socket], [], [], 0.1)[0]
 
 
 def await_nobody(appliance: Appliance, others: int = 0) -> None:
@@ -297,6 +305,57 @@ def test_replies_have_the_order_of_their_requests(device: Stream, run: Run) -> N
     assert [(reply.transaction, reply.unit, reply.pdu) for reply in replies] == [
         (number, unit, FIVE if unit == 1 else zero) for number, unit in enumerate(units)
     ]
+
+
+@pytest.mark.parametrize("kind", ["rtu", "ascii", "rtu-udp"])
+def test_a_client_without_transaction_ids_that_asks_again_gets_no_earlier_reply(
+    device: Stream, run: Run, kind: str
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(
+        configuration(
+            device.url,
+            kind=kind,
+            units={1: {"route": "bus"}, 2: "plant"},
+            memories={"plant": {"holding_registers": 9}},
+        )
+    )
+    frame = TRANSPORTS[kind].frame
+    with client(kind, scada(appliance)) as front:
+        assert isinstance(front, FramedConnection | Datagrams)
+        front.send(frame(READ))
+        device.await_requests(1)
+        assert pauses(front)
+        assert front.ask(READ, unit=2) == bytes.fromhex("03020000")
+        held.release()
+        assert front.ask(SIXTH) == SIX
+
+        together = [frame(READ), frame(SIXTH)]
+        for each in together if kind == "rtu-udp" else [b"".join(together)]:
+            front.send(each)
+        assert sorted(front.replies(2)) == [(1, FIVE), (1, SIX)], "they were sent together"
+        assert front.is_quiet()
+
+
+def test_a_broadcast_is_sent_although_its_client_asks_again(device: Stream, run: Run) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, kind="rtu"))
+    frame = TRANSPORTS["rtu"].frame
+    with client("rtu", scada(appliance)) as other, client("rtu", scada(appliance)) as front:
+        assert isinstance(front, FramedConnection)
+        other.send(frame(READ))
+        device.await_requests(1)
+        front.send(frame(WRITE, 2) + frame(WRITE, 0))
+        await_count(appliance, "waiting", 3)
+        assert pauses(front)
+        front.send(frame(READ))
+        await_count(appliance, "withdrawn", 1)
+        held.release()
+        assert front.replies(1) == [(1, FIVE)]
+
+    assert [asked.unit for asked in device.requests] == [1, 0, 1]
 
 
 def test_a_request_to_memory_waits_for_the_write_before_it(

@@ -106,6 +106,8 @@ struct Answering<F: Framing> {
     reported: Reported,
     /// `None` until a request is answered later.
     deferred: Option<Box<Deferred>>,
+    /// Whether the next request shows that its peer no longer waits for replies to earlier ones.
+    gives_up: bool,
     /// The engine waits until it is dropped; `None` before the connection is served.
     running: Option<watch::Receiver<bool>>,
 }
@@ -252,6 +254,8 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             self.reads_in_turn += 1;
             let read = read?;
             self.renew()?;
+            self.answering.gives_up =
+                !F::HAS_IDS && self.answering.is_waiting() && self.deadlines.has_paused();
             let answered = self.answering.answer(&input[..partial + read], output);
             self.note_answered(&answered, WORK_OF_READ);
             let output = &output[..answered.len];
@@ -415,6 +419,7 @@ impl<F: Framing> Answering<F> {
             delimiter: ASCII_DELIMITER,
             reported: Reported::default(),
             deferred: None,
+            gives_up: false,
             running: None,
         }
     }
@@ -435,6 +440,9 @@ impl<F: Framing> Answering<F> {
             let before = self.before.clone();
             match F::next(&mut self.before, rest, || self.delimiter, &mut decoded) {
                 Next::Request { tag, unit_id, pdu, len } => {
+                    if std::mem::take(&mut self.gives_up) {
+                        self.give_up();
+                    }
                     let place = self.unit_server.elsewhere(&self.rights, unit_id, pdu);
                     if place.is_some() || self.deferred.is_some() {
                         let deferred = self.deferred.get_or_insert_default();
@@ -538,14 +546,15 @@ impl<F: Framing> Answering<F> {
         self.context.ended(end, self.peer.clone());
     }
 
-    /// The connection has ended. Replies of devices that still come are recorded.
+    /// The peer has disconnected, or waits no longer. Replies of devices that still come are recorded.
     fn give_up(&mut self) {
-        let Some(deferred) = self.deferred.take().filter(|deferred| !deferred.is_empty()) else {
+        let Some(deferred) = self.deferred.as_mut().filter(|deferred| !deferred.is_empty()) else {
             return;
         };
-        let running = self.running.take();
+        let given_up = deferred.give_up(!F::HAS_IDS);
+        let running = self.running.clone();
         let (context, unit_server) = (Arc::clone(&self.context), Arc::clone(&self.unit_server));
-        let (peer, given_up) = (self.peer.clone(), deferred.give_up());
+        let peer = self.peer.clone();
         tokio::spawn(async move {
             for waiting in given_up {
                 if let Some((asked, reply)) = waiting.complete(&unit_server).await {

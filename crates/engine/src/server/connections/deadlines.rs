@@ -9,6 +9,9 @@ use crate::server::reports::event::Kind;
 /// A timer without a deadline fires after this time.
 pub(crate) const NO_DEADLINE: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
 
+/// Requests that are sent together arrive within this time of each other.
+pub(crate) const TOGETHER: Duration = Duration::from_millis(50);
+
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Timeouts {
     /// The longest time without a request. `None`: no limit.
@@ -85,6 +88,12 @@ impl Deadlines {
     #[inline]
     pub(super) fn note_request(&mut self, now: Instant) {
         self.last_request = now;
+    }
+
+    /// Whether what arrives now was sent after a pause, not together with the last request or because of
+    /// the last reply.
+    pub(super) fn has_paused(&self) -> bool {
+        self.last_request.elapsed() > self.timeouts.frame.unwrap_or(TOGETHER)
     }
 
     /// All that has arrived was complete.

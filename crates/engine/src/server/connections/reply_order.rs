@@ -3,6 +3,9 @@
 //!
 //! A request that can be answered here waits until all before it are answered: its client expects the
 //! effects of those. A connection with too many such requests is not read for a while.
+//!
+//! Without transaction ids, a client that sends another request after a pause has given up: no reply to an
+//! earlier one may come then.
 
 use std::collections::VecDeque;
 use std::net::IpAddr;
@@ -115,15 +118,18 @@ impl Deferred {
         Deferral::Later(refused)
     }
 
-    /// The client has disconnected. Requests that wait for their turn are not sent. Returns the others, whose
-    /// replies still come.
-    pub(in crate::server) fn give_up(self) -> VecDeque<Waiting> {
-        for waiting in &self.waiting {
-            if let Expected::Pending(pending) = &waiting.reply {
+    /// The client has disconnected, or waits no longer. Requests that wait for their turn are not sent,
+    /// except broadcasts to unit id 0, which have no reply to wait for. Returns the others, whose replies
+    /// still come.
+    pub(in crate::server) fn give_up(&mut self, has_broadcasts: bool) -> VecDeque<Waiting> {
+        for Waiting { asked, reply, .. } in &self.waiting {
+            if let Expected::Pending(pending) = reply
+                && !(has_broadcasts && asked.unit_id == 0)
+            {
                 pending.give_up();
             }
         }
-        self.waiting
+        std::mem::take(&mut self.waiting)
     }
 
     /// Keeps received bytes until there is room.

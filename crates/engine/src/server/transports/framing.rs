@@ -38,6 +38,8 @@ pub(crate) trait Framing: Send + Sync + 'static {
     const SHORTEST: usize;
     /// The longest frame.
     const MAX_LEN: usize;
+    /// Whether a reply names its request. Otherwise, a late one is taken for the reply to the next request.
+    const HAS_IDS: bool;
 
     /// What is known of the bytes before those that are looked at.
     type Before: Default + Clone + Send;
@@ -85,6 +87,7 @@ impl<const HAS_PACKETS: bool> Framing for MbapOnPort<HAS_PACKETS> {
     const HEADER_LEN: usize = mbap::HEADER_LEN;
     const SHORTEST: usize = mbap::HEADER_LEN + 1;
     const MAX_LEN: usize = mbap::MAX_LEN;
+    const HAS_IDS: bool = true;
 
     type Before = ();
 
@@ -142,6 +145,7 @@ impl Framing for Rtu {
     const HEADER_LEN: usize = 1;
     const SHORTEST: usize = 4;
     const MAX_LEN: usize = rtu::MAX_LEN;
+    const HAS_IDS: bool = false;
 
     type Before = rtu_stream::Requests;
 
@@ -196,6 +200,7 @@ impl Framing for Ascii {
     /// A function code without data.
     const SHORTEST: usize = 1 + 2 * 3 + 2;
     const MAX_LEN: usize = ascii::MAX_LEN;
+    const HAS_IDS: bool = false;
 
     type Before = ();
 

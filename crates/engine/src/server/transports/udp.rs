@@ -6,6 +6,7 @@ use std::collections::hash_map::Entry;
 use std::io::{self, ErrorKind, IoSliceMut};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
+use std::time::Instant;
 
 use holdfast_protocol::frame::{mbap, rtu};
 use holdfast_protocol::pdu::{self, ExceptionCode};
@@ -17,6 +18,7 @@ use tokio::sync::watch;
 use tokio::task::{JoinSet, yield_now};
 
 use crate::link::{Asker, source};
+use crate::server::connections::deadlines::TOGETHER;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected};
@@ -192,6 +194,9 @@ impl ModbusUdp {
         let Some(buffer) = output[D::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return 0;
         };
+        if let Some(newest) = later.newest.get_mut(&peer) {
+            newest.0 = Instant::now();
+        }
         if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
             let asker = later.asker(peer.ip());
             let asked = Asked::send(context, place, (tag, unit_id, request), |permit| {
@@ -204,12 +209,12 @@ impl ModbusUdp {
             context.note_refused(refused, &Reported::default(), Some(&peer.into()));
             return match reply {
                 Expected::Pending(pending) => {
-                    let meta = *meta;
+                    let (meta, now) = (*meta, Instant::now());
                     let ours = (Arc::clone(&self.unit_server), Arc::clone(context));
                     let reply =
                         asked.answered(pending, ours, Some(peer.into()), later.running.clone());
-                    later.begin(&asker, peer.ip(), async move {
-                        Completed { meta, tag, unit_id, pdu: reply.await.pdu }
+                    later.begin(&asker, (peer, now), async move {
+                        Completed { meta, asked: now, tag, unit_id, pdu: reply.await.pdu }
                     });
                     0
                 }
@@ -231,6 +236,8 @@ impl ModbusUdp {
 struct Later {
     /// The clients that wait for replies.
     clients: HashMap<IpAddr, Client>,
+    /// For each peer that waits, when its newest request came, and for how many replies it waits.
+    newest: HashMap<SocketAddr, (Instant, usize)>,
     replies: JoinSet<Completed>,
     /// The engine waits until it is dropped.
     running: watch::Receiver<bool>,
@@ -244,7 +251,8 @@ struct Client {
 
 impl Later {
     fn new(running: watch::Receiver<bool>) -> Later {
-        Later { clients: HashMap::new(), replies: JoinSet::new(), running }
+        let (clients, newest) = (HashMap::new(), HashMap::new());
+        Later { clients, newest, replies: JoinSet::new(), running }
     }
 
     fn asker(&self, address: IpAddr) -> Asker {
@@ -265,37 +273,50 @@ impl Later {
     fn begin(
         &mut self,
         asker: &Asker,
-        address: IpAddr,
+        (peer, now): (SocketAddr, Instant),
         completed: impl Future<Output = Completed> + Send + 'static,
     ) {
         let client = Client { source: asker.source, waiting: 0 };
-        self.clients.entry(address).or_insert(client).waiting += 1;
+        self.clients.entry(peer.ip()).or_insert(client).waiting += 1;
+        self.newest.entry(peer).or_insert((now, 0)).1 += 1;
         self.replies.spawn(completed);
     }
 
-    fn end(&mut self, address: IpAddr) {
-        if let Entry::Occupied(mut client) = self.clients.entry(address) {
+    /// A reply has come to what a peer asked at that time. Returns whether the peer has asked again after a
+    /// pause: then it has given up.
+    fn end(&mut self, peer: SocketAddr, asked: Instant) -> bool {
+        if let Entry::Occupied(mut client) = self.clients.entry(peer.ip()) {
             client.get_mut().waiting -= 1;
             if client.get().waiting == 0 {
                 client.remove();
             }
         }
+        let Entry::Occupied(mut entry) = self.newest.entry(peer) else { return false };
+        let (newest, waiting) = entry.get_mut();
+        *waiting -= 1;
+        let is_late = newest.duration_since(asked) > TOGETHER;
+        if *waiting == 0 {
+            entry.remove();
+        }
+        is_late
     }
 }
 
 /// The reply of a device.
 struct Completed {
     meta: RecvMeta,
+    asked: Instant,
     tag: u16,
     unit_id: u8,
     pdu: Vec<u8>,
 }
 
-/// Sends the reply of a device.
+/// Sends the reply of a device. Without transaction ids, one that its peer has given up is dropped: it would
+/// be taken for the reply to the newer request.
 fn complete<D: Datagram>(socket: &Datagrams, completed: Completed, later: &mut Later) {
-    let Completed { meta, tag, unit_id, pdu } = completed;
-    later.end(meta.addr.ip());
-    if !pdu.is_empty() {
+    let Completed { meta, asked, tag, unit_id, pdu } = completed;
+    let is_late = later.end(meta.addr, asked);
+    if !pdu.is_empty() && (D::HAS_IDS || !is_late) {
         let mut frame = [0; MAX_FRAME_LEN];
         frame[D::HEADER_LEN..][..pdu.len()].copy_from_slice(&pdu);
         let len = D::complete(&mut frame, tag, unit_id, pdu.len());
@@ -355,19 +376,35 @@ mod tests {
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let _context = runtime.enter();
         let mut later = Later::new(watch::channel(false).1);
-        let first = later.asker(one);
-        later.begin(&first, one, std::future::pending());
+        let (first, now) = (later.asker(one), Instant::now());
+        let peer = SocketAddr::from((one, 1));
+        later.begin(&first, (peer, now), std::future::pending());
         while !later.is_full(one) {
             let asker = later.asker(one);
             assert_eq!(asker.source, first.source);
-            later.begin(&asker, one, std::future::pending());
+            later.begin(&asker, (peer, now), std::future::pending());
         }
         assert_eq!(later.replies.len(), MAX_PENDING_REPLIES / 2);
         let asker = later.asker(other);
         assert_eq!((later.waiting(other), later.is_full(other)), (0, false));
         assert_ne!(asker.source, first.source);
-        (0..later.waiting(one)).for_each(|_| later.end(one));
-        assert!(later.clients.is_empty());
+        assert!((0..later.waiting(one)).all(|_| !later.end(peer, now)));
+        assert!(later.clients.is_empty() && later.newest.is_empty());
+    }
+
+    #[test]
+    fn a_reply_is_late_if_its_peer_has_asked_again_after_a_pause() {
+        let [one, other] = [1, 2].map(|port| SocketAddr::from(([127, 0, 0, 1], port)));
+        let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
+        let _context = runtime.enter();
+        let mut later = Later::new(watch::channel(false).1);
+        let (asker, first) = (later.asker(one.ip()), Instant::now());
+        for (peer, asked) in [(one, first), (one, first + TOGETHER), (other, first)] {
+            later.begin(&asker, (peer, asked), std::future::pending());
+        }
+        later.newest.get_mut(&one).unwrap().0 = first + TOGETHER * 2;
+        assert!(later.end(one, first));
+        assert!(!later.end(one, first + TOGETHER) && !later.end(other, first));
     }
 
     #[cfg(unix)]
