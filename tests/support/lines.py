@@ -242,6 +242,10 @@ class Line:
             self.send(piece)
             wire.until(lambda: self._plugged.waiting() == 0, "the server has read the piece")
 
+    def pause(self, seconds: float) -> None:
+        """Waits so long, in which nothing may arrive: a silence that ends a frame."""
+        assert not select.select([self._plugged.end], [], [], seconds)[0]
+
     def receive(self) -> tuple[int, bytes]:
         """Returns the unit id and PDU of the next frame."""
         deadline = time.monotonic() + wire.DEADLINE

@@ -375,7 +375,8 @@ async fn unless_newer(
             biased;
             len = &mut answer => return lost.map_or(Ok(len.filter(|_| !is_newer)), Err),
             received = input.receive(port), if lost.is_none() => match received {
-                Ok(()) => is_newer = input.has_request(),
+                // Whatever follows the request: another unit may answer it.
+                Ok(()) => is_newer |= input.has_request(),
                 Err(error) => lost = Some(error),
             },
         }
