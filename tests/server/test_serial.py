@@ -7,6 +7,7 @@ and the reply to the next request is the first that comes.
 from __future__ import annotations
 
 import fcntl
+import itertools
 import logging
 import re
 import struct
@@ -331,6 +332,20 @@ def test_a_reply_that_comes_back_is_no_request(plant: Plant) -> None:
 
 def test_a_write_may_be_repeated_at_once(plant: Plant) -> None:
     assert plant.line.ask(READ) == ZERO
+    assert [plant.line.ask(WRITE) for _ in range(3)] == [WRITE] * 3
+
+
+@only_rtu
+def test_a_request_that_begins_like_the_reply_before_it_is_no_echo(plant: Plant) -> None:
+    """The check sum of some replies is the byte count and the first byte of the next write."""
+    places = itertools.product(range(800), range(1, 124))
+    confirmed = (struct.pack(">BHH", 16, address, count) for address, count in places)
+    reply = next(pdu for pdu in confirmed if lines.rtu(pdu)[-2] == 2 * pdu[-1])
+    for number in range(1, 4):
+        registers = lines.rtu(reply)[-1:] + bytes(2 * reply[-1] - 2) + bytes([number])
+        assert plant.line.ask(reply + bytes([2 * reply[-1]]) + registers) == reply
+        address = int.from_bytes(reply[1:3])
+        assert plant.memory.read("holding_registers", address, reply[-1])[-1] & 0xFF == number
     assert [plant.line.ask(WRITE) for _ in range(3)] == [WRITE] * 3
 
 

@@ -3,6 +3,7 @@
 
 use std::time::Duration;
 
+use holdfast_protocol::frame::rtu_stream::{Next, Requests};
 use tokio::time::Instant;
 
 /// Added to the time that a reply takes on the line: adapters hold bytes back for up to 16 ms, in both directions.
@@ -15,7 +16,8 @@ pub(super) struct LineEcho {
     /// A reply that equals its request may come again as the next request.
     is_certain: bool,
     until: Option<Instant>,
-    /// Known from the first reply that is no request.
+    is_soon: bool,
+    /// Known from replies that differ from their requests.
     has_echo: Option<bool>,
 }
 
@@ -25,17 +27,27 @@ impl LineEcho {
         self.sent.clear();
         self.sent.extend_from_slice(reply);
         self.is_certain = request != reply;
-        self.until = Some(Instant::now() + takes + DELAY);
+        (self.until, self.is_soon) = (Some(Instant::now() + takes + DELAY), false);
     }
 
-    /// The number of bytes at the start of what has been received that are the echo.
-    pub(super) fn at_start_of(&mut self, received: &[u8]) -> usize {
+    /// The number of bytes at the start of what has been received that are the echo. A request may begin like
+    /// it: while more bytes of it may come, that is open.
+    pub(super) fn at_start_of(&mut self, received: &[u8], more_may_come: bool) -> usize {
         if self.sent.is_empty() || !received.starts_with(&self.sent) {
             return 0;
         }
-        let is_soon = self.until.is_some_and(|until| Instant::now() <= until);
-        let is_echo = self.is_certain || self.has_echo.unwrap_or(is_soon);
-        if self.is_certain {
+        // It stays in time while the rest is waited for.
+        self.is_soon |= self.until.is_some_and(|until| Instant::now() <= until);
+        match Requests::default().next(received) {
+            Next::Frame { len, .. } if len > self.sent.len() => return 0,
+            Next::Incomplete if more_may_come => return 0,
+            _ => {}
+        }
+        let is_echo = match self.has_echo {
+            Some(false) if self.is_certain => self.is_soon,
+            known => known.unwrap_or(self.is_soon),
+        };
+        if self.is_certain && is_echo {
             self.has_echo = Some(true);
         }
         let len = self.sent.len();
@@ -48,10 +60,10 @@ impl LineEcho {
         received.len() < self.sent.len() && self.sent.starts_with(received)
     }
 
-    /// A request has come, which is no echo. A line that had an echo keeps it: one echo may be damaged.
+    /// A request has come, which is no echo. On a line that had an echo, it may have been damaged once.
     pub(super) fn request(&mut self) {
-        if self.is_certain && !self.sent.is_empty() && self.has_echo.is_none() {
-            self.has_echo = Some(false);
+        if self.is_certain && !self.sent.is_empty() {
+            self.has_echo = if self.has_echo == Some(true) { None } else { Some(false) };
         }
         self.sent.clear();
     }
@@ -59,6 +71,8 @@ impl LineEcho {
 
 #[cfg(test)]
 mod tests {
+    use holdfast_protocol::frame::rtu;
+
     use super::*;
 
     const READ: &[u8] = &[7, 3, 0, 0, 0, 1, 1, 1];
@@ -67,7 +81,7 @@ mod tests {
 
     fn after(echo: &mut LineEcho, request: &[u8], reply: &[u8], received: &[u8]) -> usize {
         echo.sent(request, reply, Duration::from_secs(3600));
-        let len = echo.at_start_of(received);
+        let len = echo.at_start_of(received, false);
         if len == 0 && !echo.begins_with(received) {
             echo.request();
         }
@@ -77,9 +91,9 @@ mod tests {
     #[test]
     fn a_reply_that_comes_back_is_dropped_with_whatever_follows_it_kept() {
         let mut echo = LineEcho::default();
-        assert_eq!(echo.at_start_of(READ), 0);
+        assert_eq!(echo.at_start_of(READ, false), 0);
         assert_eq!(after(&mut echo, READ, VALUE, &[VALUE, READ].concat()), VALUE.len());
-        assert_eq!(echo.at_start_of(VALUE), 0, "it comes once");
+        assert_eq!(echo.at_start_of(VALUE, false), 0, "it comes once");
     }
 
     #[test]
@@ -87,14 +101,14 @@ mod tests {
         let mut echo = LineEcho::default();
         assert_eq!(after(&mut echo, READ, VALUE, &VALUE[..3]), 0);
         assert!(echo.begins_with(&VALUE[..3]) && !echo.begins_with(VALUE));
-        assert_eq!(echo.at_start_of(VALUE), VALUE.len());
+        assert_eq!(echo.at_start_of(VALUE, false), VALUE.len());
     }
 
     #[test]
     fn a_damaged_echo_does_not_show_that_there_is_none() {
         let mut echo = LineEcho::default();
         echo.sent(READ, VALUE, Duration::ZERO);
-        assert_eq!(echo.at_start_of(&[0xFF, 7, 3]), 0);
+        assert_eq!(echo.at_start_of(&[0xFF, 7, 3], false), 0);
         assert_eq!(after(&mut echo, WRITE, WRITE, WRITE), WRITE.len());
         assert_eq!(after(&mut echo, READ, VALUE, VALUE), VALUE.len());
         assert_eq!(after(&mut echo, READ, VALUE, WRITE), 0);
@@ -114,7 +128,7 @@ mod tests {
         assert_eq!(after(&mut echo, READ, VALUE, VALUE), VALUE.len());
         echo.sent(WRITE, WRITE, Duration::ZERO);
         echo.until = None;
-        assert_eq!(echo.at_start_of(WRITE), WRITE.len());
+        assert_eq!(echo.at_start_of(WRITE, false), WRITE.len());
     }
 
     #[test]
@@ -123,6 +137,50 @@ mod tests {
         assert_eq!(after(&mut echo, WRITE, WRITE, WRITE), WRITE.len());
         echo.sent(WRITE, WRITE, Duration::ZERO);
         echo.until = None;
-        assert_eq!(echo.at_start_of(WRITE), 0);
+        assert_eq!(echo.at_start_of(WRITE, false), 0);
+    }
+
+    #[test]
+    fn a_request_that_begins_like_the_last_reply_is_no_echo() {
+        // The CRC of the reply is the byte count of the request and its first byte.
+        const REPLY: &[u8] = &[3, 16, 0, 0x99, 0, 8, 0x10, 2];
+        let mut pdu = [REPLY[1..].to_vec(), vec![0; 15]].concat();
+        let mut echo = LineEcho::default();
+        for value in 0..3 {
+            pdu[21] = value;
+            let mut request = [0; rtu::MAX_LEN];
+            let len = rtu::encode(3, &pdu, &mut request).unwrap();
+            echo.sent(&request[..len], REPLY, Duration::from_secs(3600));
+            assert!((1..len).all(|part| echo.at_start_of(&request[..part], true) == 0));
+            assert_eq!(echo.at_start_of(&request[..len], true), 0);
+            assert_eq!(echo.at_start_of(&request[..len], false), 0);
+            echo.request();
+        }
+        echo.sent(READ, REPLY, Duration::from_secs(3600));
+        assert_eq!(echo.at_start_of(REPLY, true), 0);
+        assert_eq!(echo.at_start_of(REPLY, false), REPLY.len());
+    }
+
+    #[test]
+    fn what_is_certain_must_come_soon_unless_the_line_has_an_echo() {
+        let mut echo = LineEcho::default();
+        for is_known in [false, true] {
+            echo.sent(READ, VALUE, Duration::ZERO);
+            echo.until = None;
+            assert_eq!(echo.at_start_of(VALUE, false) > 0, is_known);
+            assert_eq!(after(&mut echo, READ, VALUE, VALUE), VALUE.len());
+        }
+    }
+
+    #[test]
+    fn a_line_whose_replies_no_longer_come_back_has_no_echo() {
+        let mut echo = LineEcho::default();
+        assert_eq!(after(&mut echo, READ, VALUE, VALUE), VALUE.len());
+        assert_eq!(after(&mut echo, READ, VALUE, WRITE), 0);
+        echo.sent(WRITE, WRITE, Duration::ZERO);
+        echo.until = None;
+        assert_eq!(echo.at_start_of(WRITE, false), 0);
+        assert_eq!(after(&mut echo, READ, VALUE, READ), 0);
+        assert_eq!(after(&mut echo, WRITE, WRITE, WRITE), 0);
     }
 }

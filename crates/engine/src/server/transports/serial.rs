@@ -164,6 +164,11 @@ impl ModbusSerial {
                     if line.waits_for_rest(is_echo, |unit_id| self.is_served(unit_id)) {
                         continue;
                     }
+                    let echoed = echo.at_start_of(line.bytes(), false);
+                    if echoed > 0 {
+                        line.skip(echoed);
+                        continue;
+                    }
                     let (frame, len) = line.take();
                     self.answer_rtu(serving, port, &frame[..len], &mut line, &mut echo).await
                 }
@@ -171,7 +176,7 @@ impl ModbusSerial {
             if let Err(error) = done {
                 return error;
             }
-            line.skip(echo.at_start_of(line.bytes()));
+            line.skip(echo.at_start_of(line.bytes(), true));
         }
     }
 
@@ -247,7 +252,7 @@ impl ModbusSerial {
                 }
                 frame.push(character);
                 if ends {
-                    if echo.at_start_of(&frame) == 0 {
+                    if echo.at_start_of(&frame, false) == 0 {
                         let ahead = (&mut input, &mut echo);
                         let answered = self.answer_ascii(serving, port, &mut frame, ahead).await;
                         if let Err(error) = answered {
