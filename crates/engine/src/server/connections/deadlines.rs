@@ -10,7 +10,7 @@ use crate::server::reports::event::Kind;
 pub(crate) const NO_DEADLINE: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
 
 /// Requests that are sent together arrive within this time of each other.
-pub(crate) const TOGETHER: Duration = Duration::from_millis(50);
+pub(crate) const BURST_TIME: Duration = Duration::from_millis(50);
 
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Timeouts {
@@ -93,7 +93,7 @@ impl Deadlines {
     /// Whether what arrives now was sent after a pause, not together with the last request or because of
     /// the last reply.
     pub(super) fn has_paused(&self) -> bool {
-        self.last_request.elapsed() > self.timeouts.frame.unwrap_or(TOGETHER)
+        self.last_request.elapsed() > self.timeouts.frame.unwrap_or(BURST_TIME)
     }
 
     /// All that has arrived was complete.

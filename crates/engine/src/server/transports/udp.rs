@@ -18,7 +18,7 @@ use tokio::sync::watch;
 use tokio::task::{JoinSet, yield_now};
 
 use crate::link::{Asker, source};
-use crate::server::connections::deadlines::TOGETHER;
+use crate::server::connections::deadlines::BURST_TIME;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected};
@@ -294,7 +294,7 @@ impl Later {
         let Entry::Occupied(mut entry) = self.newest.entry(peer) else { return false };
         let (newest, waiting) = entry.get_mut();
         *waiting -= 1;
-        let is_late = newest.duration_since(asked) > TOGETHER;
+        let is_late = newest.duration_since(asked) > BURST_TIME;
         if *waiting == 0 {
             entry.remove();
         }
@@ -399,12 +399,12 @@ mod tests {
         let _context = runtime.enter();
         let mut later = Later::new(watch::channel(false).1);
         let (asker, first) = (later.asker(one.ip()), Instant::now());
-        for (peer, asked) in [(one, first), (one, first + TOGETHER), (other, first)] {
+        for (peer, asked) in [(one, first), (one, first + BURST_TIME), (other, first)] {
             later.begin(&asker, (peer, asked), std::future::pending());
         }
-        later.newest.get_mut(&one).unwrap().0 = first + TOGETHER * 2;
+        later.newest.get_mut(&one).unwrap().0 = first + BURST_TIME * 2;
         assert!(later.end(one, first));
-        assert!(!later.end(one, first + TOGETHER) && !later.end(other, first));
+        assert!(!later.end(one, first + BURST_TIME) && !later.end(other, first));
     }
 
     #[cfg(unix)]
