@@ -6,6 +6,7 @@ import asyncio
 import json
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -27,7 +28,7 @@ from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges
 from support.leases import BRIEF
 from support.nats_bus import Caller
-from support.scanner_parts import client_of, member_of, registry_of, ttls_of
+from support.scanner_parts import allowed_of, client_of, member_of, registry_of, ttls_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -55,8 +56,11 @@ def judges() -> Iterator[Judges]:
 def node(own_nats: NatsServer, run_scanner: Run) -> Callable[..., Running]:
     prepare(own_nats.url, PARTITIONS)
 
-    def start(name: str, lease_times: LeaseTimes = LEASE_TIMES) -> Running:
-        return run_scanner(own_nats, fleet=FleetSettings(FLEET, name, PARTITIONS, lease_times))
+    def start(
+        name: str, lease_times: LeaseTimes = LEASE_TIMES, check_interval_s: float = 5.0
+    ) -> Running:
+        fleet = FleetSettings(FLEET, name, PARTITIONS, lease_times, check_interval_s)
+        return run_scanner(own_nats, fleet=fleet)
 
     return start
 
@@ -280,6 +284,88 @@ def test_a_command_reaches_the_device_whoever_receives_it(
         assert len({number for number, _ in judge.writes}) == 1
     refused = caller.request("modbus.command.t0", "70000")
     assert "outside" in refused["error"]
+
+
+def deaf(running: Running) -> None:
+    """Changes of subscriptions don't reach a node, as between a new connection and its consumer."""
+    bucket = member_of(running.scanner).desired._bucket
+    assert bucket is not None, "it is open"
+    running.do(bucket.unfollow())
+
+
+def test_a_command_uses_the_newest_definition_of_its_tag(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    nodes = [node(name, check_interval_s=1000.0) for name in "ab"]
+    share(*nodes)
+    subscribe_all(caller, judges)
+    wire.until(lambda: all(len(devices_of(each)) == 4 for each in nodes), "both know all")
+    for each in nodes:
+        deaf(each)
+    for number in range(len(judges.devices)):
+        key = D0.replace("ZDA", f"ZD{'AEIM'[number]}")
+        changed = caller.text(WANTS, key).replace('"writable":null', '"writable":false')
+        caller.put(WANTS, key, changed)
+        for _ in range(6):  # Any node may receive it.
+            answer = caller.request(f"modbus.command.t{number}", "1")
+            assert "not writable" in answer.get("error", ""), answer
+    assert not any(judge.writes for judge in judges.devices)
+
+
+def test_a_command_uses_the_newest_address_of_its_device(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    running = node("a", check_interval_s=1000.0)
+    share(running)
+    former, new, *_ = judges.devices
+    assert caller.request("modbus.subscribe", wanted(former))["success"]
+    deaf(running)
+    before, after = f'"port":{former.port}', f'"port":{new.port}'
+    caller.put(WANTS, D0, caller.text(WANTS, D0).replace(before, after))
+    assert caller.request("modbus.command.t0", "7") == {"success": True}
+    assert ([value for _, value in new.writes], former.writes) == ([7], [])
+
+
+def test_a_command_is_refused_while_subscriptions_cant_be_read(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    running = node("a", check_interval_s=1000.0)
+    share(running)
+    [judge, *_] = judges.devices
+    assert caller.request("modbus.subscribe", wanted(judge))["success"]
+    caller.do(caller.client.jetstream().delete_stream(f"KV_{WANTS}"))
+    answer = caller.request("modbus.command.t0", "7")
+    assert answer["error"].startswith(f"not written: {WANTS} can't be read: "), answer
+    assert not judge.writes
+    wire.until(lambda: caller.request("modbus.command.t0", "8")["success"], "it is stored again")
+    assert [value for _, value in judge.writes] == [8]
+
+
+def test_a_name_that_is_looked_up_delays_no_other_device(
+    node: Callable[..., Running],
+    caller: Caller,
+    judges: Judges,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    running = node("a")
+    share(running)
+    for number in range(2):
+        request = wanted(judges.devices[number], number)
+        assert caller.request("modbus.subscribe", request)["success"]
+    allowed, is_asked = allowed_of(running.scanner), threading.Event()
+    find = allowed.find
+
+    async def slow(target: Any, **more: Any) -> Any:
+        if target.host == "slow.example":
+            is_asked.set()
+            await asyncio.Event().wait()
+        return await find(target, **more)
+
+    monkeypatch.setattr(allowed, "find", slow)
+    caller.put(WANTS, D0, caller.text(WANTS, D0).replace("127.0.0.1", "slow.example"))
+    assert is_asked.wait(wire.DEADLINE)
+    caller.put(WANTS, D1, caller.text(WANTS, D1).replace('"address":0', '"address":10'))
+    wire.until(lambda: devices_of(running)["d1"].tags["t1"].address == 10, "it is adopted")
 
 
 def test_many_devices_are_browsed_in_pages(

@@ -100,6 +100,8 @@ class Commands:
         many seconds the write may wait for the device. Raises `Refused`, and `Moved` if another
         node has the device.
         """
+        # A tag may have been moved to another register by a request that another node has answered.
+        await self._placement.refresh(device_id)
         # Looked up again: the device may have been replaced while the command waited.
         device = self._registry.devices.get(device_id)
         if device is None or tag_id not in device.tags:

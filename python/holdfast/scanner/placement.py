@@ -188,6 +188,12 @@ class Placement:
         """
         return await change()
 
+    async def refresh(self, _device: str, /) -> None:
+        """Carries out the latest change of the subscriptions of a device, whoever has made it.
+
+        Raises `Refused` if it can't be known.
+        """
+
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Notes that tags of a subscription are removed."""
 

@@ -96,6 +96,9 @@ MARKER_TTL_S = 60.0
 WRONG_SEQUENCE = (10071, 10164)
 """Error codes of JetStream: the key has another revision than expected."""
 
+NO_MESSAGE = 10037
+"""No message matches."""
+
 OTHER_SETTINGS = 10058
 """The stream exists with other settings."""
 
@@ -243,6 +246,17 @@ class KeyBucket:
             return await jetstream.get_last_msg(self._stream, f"{self._pre}{key}")
         except NotFoundError:
             return None
+
+    async def newer(self, key: str, revision: int) -> RawStreamMsg | None:
+        """Reads a key; `None` if it has no later revision. Raises the errors of nats-py."""
+        jetstream = self.client.jetstream(timeout=self._answer_timeout_s)
+        subject = f"{self._pre}{key}"
+        try:
+            return await jetstream.get_msg(self._stream, revision + 1, subject, next=True)
+        except NotFoundError as error:
+            if error.err_code == NO_MESSAGE:
+                return None
+            raise  # The bucket is gone.
 
     async def follow_keys(
         self,

@@ -203,6 +203,10 @@ class DesiredState:
                 await self._put(TERMS, value, revision)
                 return
 
+    def revision(self, device: str) -> int:
+        """The last known revision of a device; 0 if none is known."""
+        return self._values.get(device, (0, b""))[0]
+
     def value(self, device: str) -> tuple[int, DesiredDevice | None]:
         """The last known revision and value of a device; `None` without subscriptions."""
         revision, value = self._values.get(device, (0, b""))
@@ -226,12 +230,17 @@ class DesiredState:
         return stored
 
     async def read(self, device: str) -> None:
-        """Reads the value of a device anew. Raises errors of nats-py."""
-        revision, value = await self._get(DEVICE + _token(device))
-        self._learn(device, revision, value)
+        """Reads the value of a device, if it is newer than the known one.
+
+        Raises errors of nats-py.
+        """
+        assert self._bucket is not None, "it is open"
+        found = await self._bucket.newer(DEVICE + _token(device), self.revision(device))
+        if found is not None:
+            self._learn(device, found.seq or 0, found.data or b"")
 
     def _learn(self, device: str, revision: int, value: bytes) -> bool:
-        if revision <= self._values.get(device, (0, b""))[0]:
+        if revision <= self.revision(device):
             return False
         self._values[device] = (revision, self._checked(device, value))
         return True

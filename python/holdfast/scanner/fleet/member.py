@@ -117,7 +117,12 @@ class FleetMember(Placement):
         try:
             async with tasks.beating(self.fleet.heartbeat):
                 await self._open(ready)
-                works = (self.fleet.run(), self._follow_again(), self._adopt_changes())
+                works = (
+                    self.fleet.run(),
+                    self._follow_again(),
+                    self._adopt_changes(),
+                    self._adopt_refused(),
+                )
                 running += [asyncio.create_task(work) for work in works]
                 done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
                 for task in done:
@@ -181,25 +186,25 @@ class FleetMember(Placement):
 
     async def _adopt_changes(self) -> None:
         """Carries out what other nodes have stored."""
-        retry_at = 0.0
+        async with asyncio.TaskGroup() as running:
+            while True:
+                await self._has_touched.wait()
+                self._has_touched.clear()
+                touched, self._touched = self._touched, set()
+                # A device may wait for a name server; what changes next does not wait for it.
+                running.create_task(self._adopt_all(touched))
+
+    async def _adopt_refused(self) -> None:
         while True:
-            await tasks.within(ADOPT_RETRY_S, self._has_touched.wait())
-            self._has_touched.clear()
-            touched, self._touched = self._touched, set()
-            await self._adopt_all(touched)
-            if time.monotonic() >= retry_at:
-                # Together: each may wait for a name server, and what changes waits for all.
-                await asyncio.gather(*map(self._adopt, tuple(self._refused)))
-                retry_at = time.monotonic() + ADOPT_RETRY_S
+            await asyncio.sleep(ADOPT_RETRY_S)
+            await asyncio.gather(*map(self._adopt, tuple(self._refused)))
 
     async def _adopt_all(self, devices: Collection[str]) -> None:
-        for device in devices:
-            await self._adopt(device)
+        await asyncio.gather(*map(self._adopt, devices))
         # One that comes later may have been in the way, as on a connection with other settings.
         refused = self._refused.intersection(devices)
         if len(refused) < len(devices):
-            for device in refused:
-                await self._adopt(device)
+            await asyncio.gather(*map(self._adopt, refused))
 
     def _on_change(self, device: str) -> None:
         self._touched.add(device)
@@ -207,7 +212,18 @@ class FleetMember(Placement):
 
     async def _adopt(self, device: str) -> None:
         async with self._device_host.lock(device):
-            await self._adopt_now(device)
+            if self._applied.get(device, 0) != self.desired.revision(device):
+                await self._adopt_now(device)
+
+    async def refresh(self, device: str, /) -> None:
+        """Carries out the latest change of a device. Raises `Refused` if it can't be read."""
+        try:
+            await self.desired.read(device)
+        except (Error, OSError) as error:
+            self._has_new_client.set()  # The bucket may be lost.
+            reason = nats_reason(error)
+            raise Refused(f"not written: {self.desired.bucket} can't be read: {reason}") from None
+        await self._adopt(device)
 
     async def _adopt_now(self, device: str) -> Refused | None:
         """Returns why it is refused here. Then this node does not know the device any more."""
@@ -320,6 +336,10 @@ class FleetMember(Placement):
         of_partition = self._devices.get(device.partition, {})
         if of_partition.get(device.id) is device:
             del of_partition[device.id]
+
+    def known(self, device: ScannedDevice) -> ScannedDevice:
+        """Returns a device as it is known now; another node may have changed its address."""
+        return self._registry.devices.get(device.id, device)
 
     def is_own(self, device: ScannedDevice, /) -> bool:
         """Whether this node polls a device, now."""

@@ -104,7 +104,8 @@ class OtherNodes:
         end = time.monotonic() + self._move_timeout_s
         why = f"no node polls {device.id} now"
         while True:
-            left = remaining_s()  # Each time: this loop may run for seconds.
+            # Each time: this loop may run for seconds, and the address of the device may change.
+            left, device = remaining_s(), self._member.known(device)
             owner = self._fleet.holder(device.partition)
             if self._member.is_own(device):
                 with contextlib.suppress(Moved):
