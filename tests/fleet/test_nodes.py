@@ -28,7 +28,13 @@ from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges
 from support.leases import BRIEF
 from support.nats_bus import Caller
-from support.scanner_parts import allowed_of, client_of, member_of, registry_of, ttls_of
+from support.scanner_parts import (
+    allowed_of,
+    client_of,
+    member_of,
+    registry_of,
+    ttls_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -485,6 +491,47 @@ def test_a_subscription_ends_by_its_ttl_unless_any_node_renews_it(
     wire.until(lambda: caller.request("modbus.browse", "")["count"] == 1, "it has ended")
     registries = [registry_of(running.scanner) for running in nodes]
     wire.until(lambda: all(len(each.devices) == 1 for each in registries), "for all")
+
+
+def test_a_subscription_that_is_made_permanent_stays(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    nodes = [node("a"), node("b")]
+    share(*nodes)
+    [judge, *_] = judges.devices
+    key = SubscriptionKey("d0", "hmi")
+    times = [ttls_of(running.scanner) for running in nodes]
+    assert caller.request("modbus.subscribe", wanted(judge, ttl=1000))["success"]
+    wire.until(lambda: all(key in each._ends for each in times), "both nodes know it")
+    assert caller.request("modbus.subscribe", wanted(judge))["success"]
+    wire.until(lambda: not any(key in each._ends for each in times), "no node ends it")
+
+
+@pytest.mark.parametrize("is_renewed", [True, False])
+def test_a_subscription_that_another_node_has_changed_does_not_end(
+    node: Callable[..., Running], caller: Caller, judges: Judges, is_renewed: bool
+) -> None:
+    running = node("a", check_interval_s=1000.0)
+    share(running)
+    assert caller.request("modbus.subscribe", wanted(judges.devices[0], ttl=1000))["success"]
+    deaf(running)
+    value = caller.text(WANTS, D0)
+    if is_renewed:
+        value = renewed(value)
+    caller.put(WANTS, D0, value)
+    key, times = SubscriptionKey("d0", "hmi"), ttls_of(running.scanner)
+    before = times._ends[key]
+    running.do(let_pass(times, 1000))
+    wire.until(lambda: times._ends.get(key, 0.0) > before, "it is found again, with a new time")
+    assert set(devices_of(running)["d0"].subscribers) == {"hmi"}
+    assert json.loads(caller.text(WANTS, D0))["requests"]
+
+
+def renewed(value: str) -> str:
+    """A value of the bucket as a node stores it that has got the same requests again."""
+    desired = json.loads(value)
+    desired["renewed"] = {name: at + 1 for name, at in desired["renewed"].items()}
+    return json.dumps(desired)
 
 
 def are_later(times: list[SubscriptionTtls], key: SubscriptionKey, before: list[float]) -> bool:

@@ -161,20 +161,25 @@ class Requests:
             if not ttls.is_due(subscription):  # It was renewed while this waited.
                 return
             device = self._registry.devices.get(device_id)
-            ttl = None
-            if device is not None and not self._placement.is_own(device):
+            subscriber = None if device is None else device.subscribers.get(subscriber_id)
+            if device is None or subscriber is None or not self._placement.is_own(device):
                 # The node that polls the device ends it. If it does not, this one looks again.
-                subscriber = device.subscribers.get(subscriber_id)
-                ttl = None if subscriber is None else subscriber.ttl
-            ttls.renew(device_id, subscriber_id, ttl)
-            if ttl is not None:
+                ttls.renew(device_id, subscriber_id, None if subscriber is None else subscriber.ttl)
                 return
+
+            async def change() -> bool:
+                # Each time: another node may have renewed it, which a failed attempt finds out.
+                if is_due := ttls.is_due(subscription):
+                    self._devices.remove(UnsubscribeRequest(device_id, subscriber_id))
+                return is_due
+
             try:
-                await self._remove_stored(UnsubscribeRequest(device_id, subscriber_id))
+                has_ended = await self._placement.store(device_id, change)
             except Refused:  # JetStream fails: the subscription must not stay for ever.
                 ttls.renew(device_id, subscriber_id, RETRY_EXPIRY_S)
                 return
-        log_lines.write(logging.INFO, "expired", device=device_id, subscriber=subscriber_id)
+        if has_ended:
+            log_lines.write(logging.INFO, "expired", device=device_id, subscriber=subscriber_id)
 
     def is_entry(self, device: str, subscriber: str | None) -> bool:
         """Whether a subscription is from an entry of a bucket."""

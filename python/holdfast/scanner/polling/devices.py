@@ -74,7 +74,9 @@ class Devices:
         device = change.device
         if device is None or subscription.subscriber not in device.subscribers:
             return change.new
-        if renewed:
+        # Without `renewed`, only a time that runs runs on, and only if the subscription has one.
+        runs = self.ttls.ends(device.id, subscription.subscriber)
+        if renewed or subscription.ttl is None or not runs:
             self.ttls.renew(device.id, subscription.subscriber, subscription.ttl)
         if change.former is not None:
             self._drop(change.former)

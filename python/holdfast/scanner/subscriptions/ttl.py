@@ -37,6 +37,10 @@ class SubscriptionTtls:
         self._ends[key] = self._clock() + ttl
         self._changed.set()
 
+    def ends(self, device: str, subscriber: str) -> bool:
+        """Returns whether the time of a subscription runs."""
+        return SubscriptionKey(device, subscriber) in self._ends
+
     def connected(self, is_connected: bool) -> None:
         """Stops the time of all subscriptions, or starts it again."""
         self._is_running = is_connected
