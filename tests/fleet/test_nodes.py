@@ -534,6 +534,27 @@ def renewed(value: str) -> str:
     return json.dumps(desired)
 
 
+def test_a_device_that_no_node_reports_is_not_online(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    running = node("a")
+    share(running)
+    assert caller.request("modbus.subscribe", wanted(judges.devices[0]))["success"]
+
+    def shown() -> tuple[str, str | None, str]:
+        [device] = caller.request("modbus.browse", "")["devices"]
+        [value] = caller.request("modbus.variables", "")
+        return device["state"], device.get("error"), value["quality"]
+
+    wire.until(lambda: shown() == ("online", None, "good"), "it is scanned")
+
+    async def lose() -> None:
+        member_of(running.scanner)._lost(devices_of(running)["d0"].partition)
+
+    running.do(lose())
+    assert shown() == ("offline", "no node reports it", "bad")
+
+
 def are_later(times: list[SubscriptionTtls], key: SubscriptionKey, before: list[float]) -> bool:
     return all(each._ends[key] > end for each, end in zip(times, before, strict=True))
 

@@ -140,6 +140,8 @@ class Devices:
         """Polls a device no more: another node will."""
         self._polling.drop(device)
         device.polled_as = ""
+        # Shown only if no node reports the device: its last values are out of date then.
+        device.health = Health("offline", error="no node reports it")
 
     def pause(self) -> None:
         """Stops polling all devices until `resume`."""
