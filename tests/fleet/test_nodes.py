@@ -32,6 +32,7 @@ from support.scanner_parts import (
     allowed_of,
     client_of,
     member_of,
+    polling_of,
     registry_of,
     ttls_of,
 )
@@ -532,6 +533,33 @@ def renewed(value: str) -> str:
     desired = json.loads(value)
     desired["renewed"] = {name: at + 1 for name, at in desired["renewed"].items()}
     return json.dumps(desired)
+
+
+def test_a_renewal_at_another_node_causes_no_scan(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    running = node("a")
+    share(running)
+    [judge, *_] = judges.devices
+    one = wanted(judge, scanRate=60_000)
+    one["tags"][0]["null"] = [8, 0]
+    other = {**one, "subscriberId": "log", "publish": "change", "ttl": 1000}
+    for request in (one, other):
+        assert caller.request("modbus.subscribe", request)["success"]
+    key, times = SubscriptionKey("d0", "log"), ttls_of(running.scanner)
+    before, device, polling = (
+        times._ends[key],
+        devices_of(running)["d0"],
+        polling_of(running.scanner),
+    )
+    wire.until(lambda: device not in polling._pending_changes, "it is polled")
+    polled_as = device.polled_as
+    # Each process has its own order of the null values.
+    value = renewed(caller.text(WANTS, D0)).replace("[8, 0]", "[0, 8]")
+    caller.put(WANTS, D0, value)
+    wire.until(lambda: times._ends[key] > before, "it is renewed")
+    # An extra scan begins with another name in the poller.
+    assert (device.polled_as, device in polling._pending_changes) == (polled_as, False)
 
 
 def test_a_device_that_no_node_reports_is_not_online(

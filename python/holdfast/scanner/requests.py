@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.jetstream.entries import requests as stored_requests
+from holdfast.scanner.jetstream.entries import restored
 from holdfast.scanner.jetstream.entry_subscriptions import check_entry
 from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
 from holdfast.scanner.messages.types import Answer, SubscribeRequest, UnsubscribeRequest
@@ -252,6 +254,11 @@ class Requests:
         renewed: Collection[str],
     ) -> None:
         for subscriber, requests in desired.items():
+            if list(requests) == self._carried_out(device, subscriber):
+                # Adding it again would make the device be scanned, and its values be published.
+                if subscriber in renewed:
+                    self._devices.ttls.renew(device, subscriber, requests[0].ttl)
+                continue
             tags: set[str] = set()
             for request in requests:
                 subscription = subscription_of(request, self._rules)
@@ -259,3 +266,10 @@ class Requests:
                 await self._devices.add(subscription, renewed=subscriber in renewed)
                 tags |= subscription.tags.keys()
             self._devices.keep_only(device, subscriber, tags)
+
+    def _carried_out(self, device: str, subscriber: str) -> list[SubscribeRequest]:
+        """Returns the requests that make a subscription as it is known here."""
+        known = self._registry.devices.get(device)
+        if known is None or subscriber not in known.subscribers:
+            return []
+        return list(map(restored, stored_requests(known, subscriber)))

@@ -121,7 +121,8 @@ def _tag(tag: Tag, options: TagOptions) -> bytes:
         encoding=tag.encoding,
         writable=options.writable,
         description=options.description,
-        null=[_marker(marker) for marker in tag.null] or None,
+        # Sorted: each process has its own order of a set, and nodes of a fleet compare requests.
+        null=sorted(map(_marker, tag.null), key=str) or None,
         profile=tag.profile,
     )
     text = _encode(made)
