@@ -286,6 +286,41 @@ def test_after_a_reload_subscriptions_go_on(
     assert caller.request("other.browse", b"")["count"] == 0
 
 
+def test_a_reload_that_allows_a_device_again_restores_its_subscriptions(
+    run: Run,
+    nats: NatsServer,
+    caller: Caller,
+    server: holdfast.Server,
+    tmp_path: Path,
+    log: web.Records,
+) -> None:
+    def reload(text: str) -> None:
+        (tmp_path / "appliance.yaml").write_text(text)
+        assert appliance.reload(load(tmp_path / "appliance.yaml")) == ["nats"]
+        until_connected(appliance)
+
+    text = MODBUS + nats_section(nats.url) + "  keep_subscriptions: false\n"
+    appliance = run(text)
+    assert subscribed(caller, server)["success"] is True
+    for device in ("plc2", "plc3"):
+        request = subscription(server, tag("a", 0), tag("b", 1), deviceId=device)
+        assert caller.request("plant.subscribe", request)["success"] is True
+    mistaken = text.replace("devices: [127.0.0.0/8]", "devices: [10.0.0.0/8]")
+    for more in ("", "  limits: {tags: 7}\n"):
+        reload(mistaken + more)
+        assert caller.request("plant.browse", b"")["count"] == 0
+    assert len(log.of("not_restored")) == 6
+    for device, ids in (("plc2", "all"), ("plc3", ["b"])):
+        request = {"deviceId": device, "subscriberId": "hmi", "tagIds": ids}
+        assert caller.request("plant.unsubscribe", request)["success"] is True
+    reload(text)
+    found = caller.request("plant.browse", b"")["devices"]
+    assert {each["deviceId"]: [tag["id"] for tag in each["tags"]] for each in found} == {
+        "plc1": ["a"],
+        "plc3": ["a"],
+    }
+
+
 def test_devices_outside_the_list_are_not_polled(
     run: Run, nats: NatsServer, caller: Caller, server: holdfast.Server
 ) -> None:

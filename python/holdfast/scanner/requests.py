@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 from holdfast.events import log_lines
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.entries import requests as stored_requests
-from holdfast.scanner.jetstream.entries import restored
+from holdfast.scanner.jetstream.entries import restored, without
 from holdfast.scanner.jetstream.entry_subscriptions import check_entry
 from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
 from holdfast.scanner.messages.types import Answer, SubscribeRequest, UnsubscribeRequest
+from holdfast.scanner.subscriptions.key import SubscriptionKey
 from holdfast.scanner.subscriptions.subscription import subscription_of
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from holdfast.scanner.placement import Placement
     from holdfast.scanner.polling.devices import Devices
     from holdfast.scanner.responder import Responder
-    from holdfast.scanner.subscriptions.key import SubscriptionKey
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.request_rules import Rules
     from holdfast.scanner.subscriptions.subscription import Subscription
@@ -101,6 +101,8 @@ class Requests:
     _responder: Responder
     enable: Callable[[bool], None]
     """Called with the value of the `enabled` key when a program writes it."""
+    former: dict[SubscriptionKey, list[SubscribeRequest]] = field(default_factory=dict)
+    """Requests of a former scanner that are refused here. The next scanner may accept them."""
     _log: RequestLog = field(default_factory=RequestLog)
 
     async def subscribe(self, message: Msg) -> Answer:
@@ -118,6 +120,7 @@ class Requests:
                 self._devices.keep_only(
                     subscription.device, subscription.subscriber, subscription.tags
                 )
+        self.former.pop(SubscriptionKey(subscription.device, subscription.subscriber), None)
         # Outside the lock: storing can take seconds, and other requests need not wait for it.
         await self._placement.settled(subscription.device, subscription.subscriber)
         self._log.adjusted(subscription.subscriber, subscription.device, adjustments)
@@ -134,6 +137,9 @@ class Requests:
             self._buckets.check_not_entry(request.device_id, request.subscriber_id)
         async with self._devices.lock(request.device_id):
             await self._remove_stored(request)
+        former = self.former.pop(SubscriptionKey(request.device_id, request.subscriber_id), [])
+        if request.ids is not None and (left := without(former, set(request.ids))):
+            self.former[SubscriptionKey(request.device_id, request.subscriber_id)] = left
         await self._placement.settled(request.device_id, request.subscriber_id)
         self._log.adjusted(request.subscriber_id, request.device_id, adjustments)
         self._log.unsubscribed(request)

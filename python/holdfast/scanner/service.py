@@ -6,6 +6,7 @@ import asyncio
 import logging
 import threading
 import time
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
@@ -29,6 +30,7 @@ from holdfast.scanner.publish.publishers import Publishers
 from holdfast.scanner.reports.reports import Reports
 from holdfast.scanner.requests import Requests
 from holdfast.scanner.responder import Responder
+from holdfast.scanner.subscriptions.key import SubscriptionKey
 from holdfast.scanner.subscriptions.registry import Registry
 from holdfast.scanner.subscriptions.request_rules import Rules
 
@@ -180,12 +182,15 @@ class Scanner:
             await self._requests.restore(request)
         except Refused as refused:
             log_lines.write(logging.WARNING, "not_restored", **about, reason=str(refused))
+            owner = SubscriptionKey(request.device_id, request.subscriber_id)
+            self._requests.former.setdefault(owner, []).append(request)
         else:
             log_lines.write(logging.INFO, "restored", **about, tags=len(request.tags))
 
     def stored_requests(self) -> Iterator[SubscribeRequest]:
         """Yields requests that make the subscriptions, except those from entries of a bucket."""
         yield from self.former
+        yield from chain.from_iterable(self._requests.former.values())
         for device in self._registry.devices.values():
             for subscriber in device.subscribers:
                 if not self._requests.is_entry(device.id, subscriber):
