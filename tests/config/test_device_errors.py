@@ -365,12 +365,22 @@ def test_a_unit_of_a_serial_line_is_1_to_247(folder: Folder, unit: int, scheme: 
 
 
 def test_a_serial_line_is_driven_in_one_way(folder: Folder) -> None:
-    one, other = "'rtu:///dev/ttyX?baud=9600'", "'rtu:///dev/../dev/ttyX'"
+    one, other = "'rtu:///dev/ttyX?baud=9600'", "'rtu:///dev/ttyX'"
     text = changed("tcp://10.0.0.9", one) + ANOTHER.replace("tcp://10.0.0.9", other)
     assert folder.problems(text) == [
         "p.yaml:15: devices.other.url: found line settings that differ from those of "
         "devices.meter in "
         "line 4, allowed: the same settings"
+    ]
+
+
+def test_a_serial_line_has_one_name(folder: Folder) -> None:
+    """Links of /dev/serial may name different lines after adapters were plugged in again."""
+    one, other = "'rtu:///dev/ttyX'", "'rtu:///dev/../dev/ttyX'"
+    text = changed("tcp://10.0.0.9", one) + ANOTHER.replace("tcp://10.0.0.9", other)
+    assert folder.problems(text) == [
+        "p.yaml:15: devices.other.url: found another name of the serial line of devices.meter in "
+        "line 4, allowed: '/dev/ttyX'"
     ]
 
 

@@ -16,10 +16,12 @@ from holdfast.polling.faults import NO_CONNECTION
 from holdfast.tags.scale import RegisterScale
 from support import wire
 from support.brokers import free_port
-from support.fake_device import Asked, FakeDevice, Stream, exception, good
+from support.fake_device import Asked, FakeDevice, Serial, Stream, exception, good, registers
+from support.lines import RTU
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 PLACES: dict[str, tuple[Any, ...]] = {
     "temp": ("holding_registers", 0, "float32", "CDAB"),
@@ -316,7 +318,7 @@ def test_an_interval_is_a_number(poller: Poller, interval: Any) -> None:
     [
         ("tcp://127.0.0.1:1?accept_unit=255", "tcp://127.0.0.1:1", "accept_unit is None, but"),
         ("tcp://127.0.0.1:1", "tcp://127.0.0.1:1?write_multiple=1", "write_multiple is True, but"),
-        ("rtu:///dev/x", "rtu:///dev/../dev/x?baud=9600", "baud is 9600, but other devices at"),
+        ("rtu:///dev/x", "rtu:///dev/x?baud=9600", "baud is 9600, but other devices at"),
         ("rtu:///dev/x?parity=none", "rtu:///dev/x?stop_bits=2", "parity is 'even', but"),
     ],
 )
@@ -442,3 +444,62 @@ def test_a_write_needs_a_scale_that_was_read(poller: Poller, device: holdfast.Se
     name = poller.add(url(device), tags)
     with pytest.raises(ValueError, match="the scale is in holding_registers 6"):
         poller.write(name, "limit", 20)
+
+
+# Serial lines
+
+
+def adapter(device: Path, value: int) -> Serial:
+    """A serial adapter. Registers of all units at its line have one value."""
+    return Serial(RTU, device, then=lambda asked: asked.answer(registers(asked.pdu, value)))
+
+
+def plugged(link: Path, device: Path) -> None:
+    """From now on, `link` names the adapter `device`."""
+    link.unlink(missing_ok=True)
+    link.symlink_to(device)
+
+
+def add_at(poller: Poller, link: Path, name: str, unit: int = 1) -> None:
+    # The line is opened for each request: nobody has it open when its adapter is exchanged.
+    line = f"rtu://{link}?parity=none&baud=4000000&close_after=1"
+    poller.add(line, {"value": ("holding_registers", 0)}, name=name, unit=unit, interval=0.01)
+
+
+def until_read(poller: Poller, name: str, value: int) -> None:
+    """Waits until a device has a value."""
+
+    def is_read() -> bool:
+        return any((each.device, each.value) == (name, value) for each in taken(poller))
+
+    wire.until(is_read, f"{name} has {value}")
+
+
+def test_a_device_has_the_line_that_its_url_names_now(poller: Poller, tmp_path: Path) -> None:
+    a, b = tmp_path / "by-id-a", tmp_path / "by-id-b"
+    one, two = tmp_path / "ttyUSB0", tmp_path / "ttyUSB1"
+    with adapter(one, 1), adapter(two, 2):
+        plugged(a, one)
+        plugged(b, two)
+        add_at(poller, a, "a")
+        add_at(poller, b, "b")
+        until_read(poller, "a", 1)
+        until_read(poller, "b", 2)
+        plugged(a, two)
+        plugged(b, one)
+        until_read(poller, "a", 2)
+        until_read(poller, "b", 1)
+
+        add_at(poller, a, "new", unit=2)
+        until_read(poller, "new", 2)
+        poller.close()
+
+
+def test_a_serial_line_has_one_name(poller: Poller, tmp_path: Path) -> None:
+    link, device = tmp_path / "by-id", tmp_path / "ttyUSB0"
+    plugged(link, device)
+    with adapter(device, 1):
+        add_at(poller, link, "a")
+        with pytest.raises(ValueError, match=r"another name, allowed: '.*/by-id'"):
+            add_at(poller, device, "b", unit=2)
+        poller.close()

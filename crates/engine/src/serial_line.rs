@@ -122,13 +122,8 @@ impl SerialLine {
 
     /// Linux refuses to set character size and parity of a pseudo terminal.
     fn is_pseudo_terminal(&self) -> bool {
-        self.path().starts_with("/dev/pts/")
-    }
-
-    /// The path of the device itself: a link, such as those of `/dev/serial`, is another name of it.
-    pub(crate) fn path(&self) -> String {
         let path = std::fs::canonicalize(&self.device);
-        path.map_or_else(|_| self.device.clone(), |path| path.to_string_lossy().into_owned())
+        path.is_ok_and(|path| path.starts_with("/dev/pts"))
     }
 
     /// The silence that ends an RTU frame: 3.5 characters by default.

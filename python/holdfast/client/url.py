@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
@@ -153,9 +152,12 @@ def connection_of(target: Target) -> str:
 
 
 def shared_connection(target: Target) -> tuple[str, str]:
-    """The connection that polled devices share. TLS and plain TCP at one address are two."""
+    """The connection that polled devices share. TLS and plain TCP at one address are two.
+
+    A serial line has the name of its URL: a link of `/dev/serial` may name another one later.
+    """
     if isinstance(target, SerialTarget):
-        return "", os.path.realpath(target.device)
+        return "", target.device
     return target.transport, connection_of(target)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import time
 from collections import deque
 from dataclasses import replace
@@ -20,7 +21,7 @@ from holdfast.client.base import (
 )
 from holdfast.client.endpoint import endpoint
 from holdfast.client.requests import write_typed
-from holdfast.client.url import parse, shared_connection, shared_options
+from holdfast.client.url import SerialTarget, parse, shared_connection, shared_options
 from holdfast.polling.faults import LOST, fault_text
 from holdfast.polling.readings import Batch, Reader
 from holdfast.protocol import READ_BITS, READ_REGISTERS
@@ -112,9 +113,10 @@ class Poller:
         Devices at one address or serial line share a connection, and so `in_flight` and the options
         of the URL.
 
-        Raises `ValueError` for invalid arguments, a name in use, and options that differ from those
-        of another device at the address; `TypeError` if a time is not a number; `TagError` for an
-        invalid tag, and `RuntimeError` after `close`.
+        Raises `ValueError` for invalid arguments, a name in use, a serial line that other devices
+        have under another name, and options that differ from those of another device at the
+        address; `TypeError` if a time is not a number; `TagError` for an invalid tag, and
+        `RuntimeError` after `close`.
         """
         interval = checked_seconds("interval", interval, MAX_INTERVAL_S, MIN_INTERVAL_S)
         timeout = checked_seconds("timeout", timeout, MAX_TIMEOUT_S)
@@ -129,6 +131,8 @@ class Poller:
         if name in self._core_names:
             raise ValueError(f"device {name}: the name is already in use")
         place = shared_connection(target)
+        if isinstance(target, SerialTarget):
+            self._check_name(url, target.device)
         options = shared_options(target) | {"in_flight": in_flight}
         known, users = self._connections.get(place, (options, set()))
         for option, value in options.items():
@@ -160,6 +164,13 @@ class Poller:
         self._readers[core_name] = reader
         self._core_names[name] = core_name
         return name
+
+    def _check_name(self, url: str, line: str) -> None:
+        """Raises `ValueError` if devices on a serial line have it under another name."""
+        for scheme, other in self._connections:
+            if not scheme and other != line and os.path.realpath(other) == os.path.realpath(line):
+                named = f"{url!r} is the serial line of other devices under another name"
+                raise ValueError(f"{named}, allowed: {other!r}")
 
     def _free(self, name: str) -> str:
         return name if name not in self._core_names else f"{name}#{next(self._names)}"

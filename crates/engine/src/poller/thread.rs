@@ -687,7 +687,8 @@ fn address(endpoint: &Endpoint) -> Address {
         _ => None,
     };
     let (scheme, host, port) = match &endpoint.place {
-        Place::Serial(line) => return (format!("serial:{}", line.path()), None),
+        // As configured: a link of `/dev/serial` names another device after adapters were plugged in again.
+        Place::Serial(line) => return (format!("serial:{}", line.device), None),
         Place::Tcp { host, port, .. } => ("tcp", host, port),
         Place::RtuOverTcp { host, port } => ("rtu+tcp", host, port),
         Place::AsciiOverTcp { host, port } => ("ascii+tcp", host, port),
@@ -764,34 +765,8 @@ mod tests {
 
     use super::*;
     use crate::poller::{BlockSettings, Destination, ReadSettings, StatusSettings};
-    use crate::serial_line::{LineDirection, LineMode, LineParity, SerialLine};
 
     const AREA: Area = Area::HoldingRegisters;
-
-    #[cfg(unix)]
-    #[test]
-    fn names_of_one_serial_line_are_one_address() {
-        let folder = std::env::temp_dir().join(format!("holdfast-{}", std::process::id()));
-        std::fs::create_dir_all(&folder).unwrap();
-        let (device, link) = (folder.join("line"), folder.join("by-id"));
-        std::fs::write(&device, "").unwrap();
-        std::os::unix::fs::symlink(&device, &link).unwrap();
-        let of = |path: &std::path::Path| {
-            let line = SerialLine {
-                device: path.to_string_lossy().into_owned(),
-                baud: 9_600,
-                parity: LineParity::Even,
-                stop_bits: 1,
-                data_bits: 8,
-                mode: LineMode::Rtu { silence: None },
-                direction: LineDirection::Adapter,
-            };
-            address(&Place::Serial(line).into())
-        };
-        assert!(of(&device) == of(&link));
-        std::fs::remove_dir_all(&folder).unwrap();
-        assert!(of(&device) != of(&link), "neither exists");
-    }
 
     fn memory() -> Arc<Memory> {
         let layout = Layout::default().with(AREA, Span::new(10, 70).unwrap());

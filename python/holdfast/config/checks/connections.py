@@ -146,7 +146,11 @@ class AddressChecks:
         self.report.add(where, f"{message}, allowed: the same")
 
     def _line(self, path: KeyPath, target: SerialTarget, retry: RetryConfig, user: User) -> None:
-        """A serial line is shared only with equal settings, and never with a listener."""
+        """A serial line is shared only with equal settings, and never with a listener.
+
+        All its users give it the same name: the names may be of different lines after adapters were
+        plugged in again, and each user must have the line that its URL names.
+        """
         with until_invalid():
             if isinstance(user, DeviceConfig) and not 1 <= user.unit <= MAX_SERIAL_UNIT:
                 allowed = f"allowed on a serial line: a unit id from 1 to {MAX_SERIAL_UNIT}"
@@ -160,7 +164,10 @@ class AddressChecks:
             return
         if first[0] == "links":
             target = replace(target, tolerance=_tolerated(target, user, other.tolerance))
-        if replace(target, device=other.device) != other:
+        if target.device != other.device:
+            message = f"found another name of the serial line of {self.report.named(first)}"
+            self.report.add((*path, "url"), f"{message}, allowed: {show(other.device)}")
+        elif target != other:
             message = f"found line settings that differ from those of {self.report.named(first)}"
             self.report.add((*path, "url"), f"{message}, allowed: the same settings")
         elif retry != other_retry and not (first[0] == "links" and not given(user, "retry")):
