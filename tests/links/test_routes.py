@@ -774,6 +774,25 @@ def test_the_write_of_a_client_that_has_gone_is_not_sent(
     assert [asked.pdu for asked in device.requests] == [READ]
 
 
+def test_the_write_of_a_client_that_has_gone_does_not_wait_for_late_replies(
+    run: Run, connect: Connect, tmp_path: Path
+) -> None:
+    with Serial(RTU, tmp_path / "device", silent) as device:
+        appliance = run(configuration(device.url, link={"timeout": 0.2}))
+        first, gone = connect(scada(appliance)), connect(scada(appliance))
+        assert first.ask(WRITE) == exception(WRITE, 0x0B)
+        # It has its turn at once, but the reply to the first write may still come.
+        gone.send(wire.frame(WRITE))
+        await_count(appliance, "waiting", 1)
+        gone.reset()
+
+        await_count(appliance, "withdrawn", 1)
+        assert counters(appliance)["failures"] == 0
+        assert first.ask(READ) == bytes.fromhex("03021234")
+        assert [asked.pdu for asked in device.requests] == [WRITE, READ]
+        appliance.stop()
+
+
 # Sharing
 
 

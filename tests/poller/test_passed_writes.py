@@ -424,6 +424,53 @@ def test_a_write_of_rest_is_not_sent_once_its_client_has_gone(
     assert [line["outcome"] for line in writes(log)] == ["withdrawn", "done", "done"]
 
 
+@pytest.mark.parametrize("over", ["modbus", "rest"])
+def test_the_write_of_a_client_that_has_gone_while_the_line_was_busy_is_not_sent(
+    run: Run, over: str
+) -> None:
+    device_writes = HeldWrites()
+    with Stream("rtu+tcp", then=device_writes) as source:
+        reads = {
+            "one": read("holding_registers", 0, 1, ("holding_registers", 20)),
+            "other": read("holding_registers", 1, 1, ("holding_registers", 10)),
+        }
+        devices = {
+            name: device(source.url, each, **RARELY, timeout=wire.DEADLINE)
+            for name, each in reads.items()
+        }
+        appliance = run(configuration(devices, **MORE))
+        wire.until(
+            lambda: all(counters(appliance, name)["reads"] == 1 for name in reads), "all is read"
+        )
+        with wire.Connection(endpoint(appliance, "scada")) as first:
+            first.send(wire.frame(b"\x06\x00\x14\x00\x01"))
+            held = device_writes.next()
+            if over == "rest":
+                posted(appliance, 2).close()
+                withdrawn = {"withdrawn": 1}
+                wire.until(lambda: of_rest(appliance)["refused"] == withdrawn, "it is withdrawn")
+            else:
+                with wire.Connection(endpoint(appliance, "scada")) as gone:
+                    gone.send(wire.frame(b"\x06\x00\x0a\x00\x02"))
+                    until_clients(appliance, 2)
+                until_clients(appliance, 1)
+            held.answer()
+            assert first.receive().pdu == b"\x06\x00\x14\x00\x01"
+            first.send(wire.frame(b"\x06\x00\x0a\x00\x03"))
+            device_writes.next().answer()
+            assert first.receive().pdu == b"\x06\x00\x0a\x00\x03"
+        appliance.stop()
+        assert [pdu[-1] for pdu in writes_of(source)] == [1, 3]
+
+
+def until_clients(appliance: Appliance, count: int) -> None:
+    """Waits until so many clients of the listener are connected."""
+    stats = appliance.diagnostics.stats
+    wire.until(
+        lambda: stats()["listeners"]["scada"]["connections"]["open"] == count, f"{count} clients"
+    )
+
+
 def test_the_end_of_rest_withdraws_what_was_not_sent(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

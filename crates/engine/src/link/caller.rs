@@ -13,6 +13,7 @@ use holdfast_protocol::pdu::EncodedRequest;
 use holdfast_runtime::lock;
 
 use crate::client::{ClientError, Lost};
+use crate::link::limits::permit::Wanted;
 use crate::link::scheduling::queue::source;
 use crate::wake::{Wakes, pair};
 
@@ -112,6 +113,11 @@ impl Caller {
         std::mem::take(&mut lock(&self.state).done)
     }
 
+    fn note_sent(&self, ticket: u64) -> bool {
+        let mut state = lock(&self.state);
+        state.pending.get_mut(&ticket).map(|pending| pending.is_sent = true).is_some()
+    }
+
     fn end(&self, ticket: u64, outcome: Result<Vec<u8>, Arc<ClientError>>) {
         let mut state = lock(&self.state);
         let Some(Pending { request, is_sent }) = state.pending.remove(&ticket) else { return };
@@ -142,15 +148,19 @@ impl Waiting {
         self.until.map_or(Duration::MAX, |until| until.saturating_duration_since(Instant::now()))
     }
 
-    pub(super) fn is_unwanted(&self) -> bool {
+    pub(crate) fn is_unwanted(&self) -> bool {
         self.left().is_zero() || !lock(&self.caller.state).pending.contains_key(&self.ticket)
     }
 
     /// Its turn has come. Returns whether it has not been given up.
     pub(crate) fn note_sent(&self) -> bool {
-        let mut state = lock(&self.caller.state);
-        let pending = state.pending.get_mut(&self.ticket);
-        pending.map(|pending| pending.is_sent = true).is_some()
+        self.caller.note_sent(self.ticket)
+    }
+
+    /// As [`note_sent`](Waiting::note_sent), for a [`Permit`](crate::link::Permit).
+    pub(crate) fn wanted(&self) -> Wanted {
+        let (caller, ticket) = (Arc::clone(&self.caller), self.ticket);
+        Arc::new(move || caller.note_sent(ticket))
     }
 
     pub(crate) fn end(mut self, outcome: Result<Vec<u8>, Arc<ClientError>>) {

@@ -23,7 +23,7 @@ pub use fault::Fault;
 pub(crate) use fault::{confirmation, exception, exception_in};
 pub use limits::lease_fence::{Fence, Stage};
 pub(crate) use limits::lease_fence::{Pass, submit_under};
-pub(crate) use limits::permit::Permit;
+pub(crate) use limits::permit::{Permit, Wanted};
 pub(crate) use route::{Asker, Call};
 pub use route::{LinkCounters, LinkSettings, Route, SharedLink};
 pub use scheduling::in_flight::InFlight;

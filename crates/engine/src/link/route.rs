@@ -15,6 +15,7 @@ use tokio::sync::mpsc;
 use super::caller::{Caller, Waiting};
 use crate::client::{ClientError, Endpoint, StrayCounters};
 use crate::counter::counters;
+use crate::link::limits::permit::Wanted;
 use crate::link::limits::queue_share::{Place, QueueShare, Source};
 use crate::link::scheduling::in_flight::InFlight;
 use crate::link::scheduling::pending_reply::{PendingReply, ReplyTo, pending_reply};
@@ -306,6 +307,15 @@ impl Reply {
         match &self.to {
             Receiver::Listener(_, timeout) => *timeout,
             Receiver::EventLoop(to) => to.reply_timeout(),
+        }
+    }
+
+    /// What is asked at the last moment before the request is sent. Event loops know by then that its turn
+    /// has come.
+    pub(super) fn wanted(&self) -> Option<Wanted> {
+        match &self.to {
+            Receiver::Listener(to, _) => Some(to.wanted()),
+            Receiver::EventLoop(_) => None,
         }
     }
 

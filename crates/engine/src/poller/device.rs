@@ -626,7 +626,7 @@ impl Device {
             if self.poll_pause.is_doubtful() { Priority::Doubtful } else { Priority::Usual };
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
         let fence = self.settings.fence.as_ref();
-        let permit = Permit { fence: fence.cloned(), until: None };
+        let permit = Permit { fence: fence.cloned(), ..Permit::default() };
         let len = block.area.byte_len(block.count.into());
         let answer =
             self.link.call(*unit_id, &request, *timeout, priority, &permit).await.map(data);

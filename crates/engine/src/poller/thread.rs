@@ -575,7 +575,7 @@ impl Running {
         let inbox = Rc::clone(&self.inbox);
         let Running { unit_id, timeout, release, .. } = *self;
         let until = until.map(|until| until + timeout);
-        let permit = Permit { fence: self.fence.clone(), until };
+        let permit = Permit { fence: self.fence.clone(), until, wanted: None };
         spawn_local(async move {
             let fence = permit.fence.as_ref();
             let refused = |fault| to.push_write(Written { ticket, outcome: Err(fault) });
@@ -600,7 +600,7 @@ impl Running {
         let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
         let (inbox, reads) = (Rc::clone(&self.inbox), Rc::clone(&self.reads));
         let Running { unit_id, timeout, release, .. } = *self;
-        let permit = Permit { fence: self.fence.clone(), until: None };
+        let permit = Permit { fence: self.fence.clone(), ..Permit::default() };
         spawn_local(async move {
             let fence = permit.fence.as_ref();
             let Some(taken) = turn.take_to_write(fence, timeout).await else {

@@ -17,8 +17,8 @@ use super::device::ReadSettings;
 use crate::client::ClientError;
 use crate::items::{Items, touched};
 use crate::link::{
-    Caller, Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, confirmation,
-    exception, exception_in, pending_reply, submit_under,
+    Caller, Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, Wanted,
+    confirmation, exception, exception_in, pending_reply, submit_under,
 };
 
 /// The most writes into one memory that wait for devices.
@@ -66,11 +66,19 @@ enum Receiver {
 }
 
 impl Receiver {
-    /// The turn of the write has come. Returns whether it is still wanted.
-    fn is_next(&self) -> bool {
+    /// Whether its client has gone.
+    fn is_unwanted(&self) -> bool {
         match self {
-            Receiver::Client(to) => !to.is_unwanted(),
-            Receiver::EventLoop(to) => to.note_sent(),
+            Receiver::Client(to) => to.is_unwanted(),
+            Receiver::EventLoop(to) => to.is_unwanted(),
+        }
+    }
+
+    /// What is asked when the write is sent: its device may have waited for its turn on the line until then.
+    fn wanted(&self) -> Wanted {
+        match self {
+            Receiver::Client(to) => to.wanted(),
+            Receiver::EventLoop(to) => to.wanted(),
         }
     }
 
@@ -239,14 +247,15 @@ impl PassedWrite {
         timeout: Duration,
         permit: &Permit,
     ) -> Vec<Change> {
-        if !self.reply.is_next() {
+        if self.reply.is_unwanted() {
             return Vec::new();
         }
         if link.retry_at().is_some() || !self.is_mirrored(reads) {
             self.refuse(ExceptionCode::GatewayPathUnavailable);
             return Vec::new();
         }
-        let call = async |request: &EncodedRequest| {
+        let of_client = Permit { wanted: Some(self.reply.wanted()), ..permit.clone() };
+        let call = async |request: &EncodedRequest, permit| {
             link.call(unit_id, request, timeout, Priority::Urgent, permit).await
         };
         let mask = match self.request.request() {
@@ -269,23 +278,25 @@ impl PassedWrite {
                     let write = Request::WriteSingleRegister { address, value: new };
                     Some(EncodedRequest::new(&write))
                 };
-                link.read_then_write(unit_id, &read(address), masked, timeout, permit).await
+                link.read_then_write(unit_id, &read(address), masked, timeout, &of_client).await
             }
-            Some((address, ..)) => match call(&self.request).await {
+            Some((address, ..)) => match call(&self.request, &of_client).await {
                 Ok(answer) => {
                     // The memory may not know what the device had before. What it can't show is not
                     // confirmed, although the device has carried it out.
-                    value = call(&read(address)).await.ok().and_then(|pdu| register(&pdu));
+                    value = call(&read(address), permit).await.ok().and_then(|pdu| register(&pdu));
                     let unknown =
                         Fault::Exception(ExceptionCode::GatewayTargetFailedToRespond.code());
                     if value.is_some() { Ok(answer) } else { Err(unknown) }
                 }
                 refused => refused,
             },
-            None => call(&self.request).await,
+            None => call(&self.request, &of_client).await,
         };
         let pdu = match answered {
             Ok(answer) => return self.confirm(&answer, value, reads, permit).await,
+            // Its client has gone, and it was not sent.
+            Err(Fault::Expired) => return Vec::new(),
             Err(fault) => exception(&self.pdu, fault.exception()),
         };
         self.reply.send(pdu);

@@ -8,13 +8,18 @@ use tokio::time::timeout_at;
 use crate::client::ClientError;
 use crate::link::limits::lease_fence::Fence;
 
+/// Whether somebody still waits for the answer to a request that is sent now.
+pub(crate) type Wanted = Arc<dyn Fn() -> bool + Send + Sync>;
+
 /// Until when a request may be sent. The default is without a limit.
-#[derive(Debug, Clone, Default)]
+#[derive(Clone, Default)]
 pub(crate) struct Permit {
     /// The fence of the device.
     pub fence: Option<Arc<Fence>>,
     /// After this, the caller no longer expects its write to be sent.
     pub until: Option<Instant>,
+    /// `None` if it is sent even when nobody waits for its answer.
+    pub wanted: Option<Wanted>,
 }
 
 impl Permit {
@@ -24,10 +29,13 @@ impl Permit {
         if self.fence.as_ref().is_some_and(|fence| !fence.allows()) {
             return Err(ClientError::Fenced);
         }
-        if self.until.is_some_and(|until| Instant::now() >= until) {
-            return Err(ClientError::Expired);
-        }
-        Ok(())
+        if self.is_expected() { Ok(()) } else { Err(ClientError::Expired) }
+    }
+
+    /// Whether its caller still expects it to be sent.
+    pub fn is_expected(&self) -> bool {
+        self.until.is_none_or(|until| Instant::now() < until)
+            && self.wanted.as_ref().is_none_or(|wanted| wanted())
     }
 
     /// Waits for a turn; `None` if it does not come in time.

@@ -9,6 +9,8 @@ use std::task::{Context, Poll};
 use tokio::sync::oneshot::error::RecvError;
 use tokio::sync::{Notify, oneshot};
 
+use crate::link::limits::permit::Wanted;
+
 /// The two ends of a reply: where it is sent, and where it is awaited.
 pub(crate) fn pending_reply() -> (ReplyTo, PendingReply) {
     let (to, from) = oneshot::channel();
@@ -59,6 +61,12 @@ impl ReplyTo {
     /// Whether the request need not be sent any more.
     pub(crate) fn is_unwanted(&self) -> bool {
         self.to.is_closed() || self.client.is_gone.load(Ordering::Relaxed)
+    }
+
+    /// Whether the client has not disconnected, for a [`Permit`](crate::link::Permit).
+    pub(crate) fn wanted(&self) -> Wanted {
+        let client = Arc::clone(&self.client);
+        Arc::new(move || !client.is_gone.load(Ordering::Relaxed))
     }
 
     /// Waits until the client has disconnected.

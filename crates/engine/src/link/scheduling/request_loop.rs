@@ -11,6 +11,7 @@ use tokio::sync::mpsc;
 use tokio::task::spawn_local;
 use tokio::time::Instant;
 
+use crate::client::ClientError;
 use crate::link::access::Link;
 use crate::link::fault::{Exchanged, Fault, exception, exception_code, fault};
 use crate::link::limits::circuit_breaker::{CircuitBreakers, Down, OPEN_AFTER_TIMEOUTS};
@@ -102,9 +103,14 @@ impl Serving {
             return counters.withdrawn.add();
         };
         let changes = self.link.changes.get();
-        let answered =
-            self.link.exchange(unit_id, &request, timeout, true, &Permit::default()).await;
+        // A line may still wait for late replies to others. What several share is a read.
+        let wanted = if let [reply] = &replies[..] { reply.wanted() } else { None };
+        let permit = Permit { wanted, ..Permit::default() };
+        let answered = self.link.exchange(unit_id, &request, timeout, true, &permit).await;
         drop(turn);
+        if matches!(&answered, Err(error) if matches!(**error, ClientError::Expired)) {
+            return counters.withdrawn.add();
+        }
         let from_listener = replies.iter().any(Reply::is_of_listener);
         self.record((unit_id, request.pdu()[0]), &answered, from_listener, &shared);
         let error = match answered {

@@ -77,8 +77,8 @@ struct Open {
     connection: Connection,
     epoch: Instant,
     waiting: Waiting,
-    /// Requests that wait for a pause, and until when they may be sent.
-    held: Vec<(Ticket, Instant)>,
+    /// Requests that wait for a pause.
+    held: Vec<(Ticket, Permit)>,
     ended: Rc<Cell<Option<Instant>>>,
     past: Rc<RefCell<Past>>,
     strays: Arc<StrayCounters>,
@@ -139,7 +139,7 @@ impl TcpLink {
             }
             permit.check()?;
             let began = pace.began();
-            let outcome = self.carry_out(unit_id, request, deadline, attempt, permit.until).await;
+            let outcome = self.carry_out(unit_id, request, deadline, attempt, permit).await;
             let Some((answer, again)) = outcome.unwrap_or_else(|lost| Some((Err(lost), None)))
             else {
                 return Err(Arc::new(ClientError::Expired));
@@ -163,13 +163,13 @@ impl TcpLink {
         request: &EncodedRequest,
         deadline: Instant,
         attempt: Attempt,
-        until: Option<std::time::Instant>,
+        permit: &Permit,
     ) -> Result<Outcome, Failure> {
         let mut sent = self.send(unit_id, request, deadline, attempt)?;
-        if let (Some(until), Some(open)) = (until, self.open.borrow_mut().as_mut())
+        if let Some(open) = self.open.borrow_mut().as_mut()
             && open.connection.is_held()
         {
-            open.held.push((sent.ticket, until.into()));
+            open.held.push((sent.ticket, permit.clone()));
         }
         loop {
             match timeout_at(self.due(), &mut sent.outcome).await {
@@ -318,7 +318,8 @@ impl TcpLink {
         let open = self.open.borrow();
         let due = open.as_ref().and_then(|open| Some(open.epoch + open.connection.deadline()?));
         let due = due.unwrap_or_else(Instant::now);
-        open.iter().flat_map(|open| &open.held).map(|(_, until)| *until).fold(due, Instant::min)
+        let held = open.iter().flat_map(|open| &open.held);
+        held.filter_map(|(_, permit)| Some(permit.until?.into())).fold(due, Instant::min)
     }
 
     /// Ends the requests whose time is over, and the connection if that was too much; sends what has
@@ -380,15 +381,15 @@ impl Open {
         self.pass.as_ref().is_some_and(|pass| !pass.fence().allows())
     }
 
-    /// Drops the requests that have waited for a pause for too long.
+    /// Drops the requests that have waited for a pause for too long, and what nobody waits for.
     fn give_up_held(&mut self) {
         let now = Instant::now();
         let Open { connection, waiting, held, epoch, .. } = self;
         if !connection.is_held() {
             held.clear();
         }
-        held.retain(|(ticket, until)| {
-            if now < *until {
+        held.retain(|(ticket, permit)| {
+            if permit.is_expected() {
                 return true;
             }
             connection.cancel(*ticket, now.saturating_duration_since(*epoch));
@@ -522,7 +523,8 @@ mod tests {
     async fn write_within(link: &Link, time: Duration) -> Answer {
         let request = Request::WriteSingleRegister { address: 0, value: 1 };
         let write = EncodedRequest::new(&request);
-        let permit = Permit { fence: None, until: Some((Instant::now() + time).into_std()) };
+        let until = Some((Instant::now() + time).into_std());
+        let permit = Permit { until, ..Permit::default() };
         link.call(1, &write, TIMEOUT, Priority::Urgent, &permit).await
     }
 
