@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import socket
 import threading
 import time
 from collections import Counter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -19,8 +21,9 @@ from holdfast.polling.faults import fault_word
 from holdfast.types import AREAS
 from support import polled, web, wire
 from support.brokers import free_port
-from support.fake_device import HANG_UP
-from support.lines import Cable
+from support.fake_device import HANG_UP, Serial
+from support.lines import RTU, Cable
+from support.machine import needs_proc
 from support.polled import (
     Datagrams,
     Fake,
@@ -42,7 +45,6 @@ from support.running import endpoint
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from holdfast.types import Area
     from support.polled import Status
@@ -284,6 +286,31 @@ def test_a_line_that_is_not_there_is_unreachable_and_nobody_refuses(
     told = until_told(appliance, health=ERROR, last_error=UNREACHABLE)
     assert told.transport_errors > 0
     assert fault_word(counters(appliance, "meter")["last_error"]) == "unreachable"
+
+
+@needs_proc
+def test_an_adapter_that_is_unplugged_between_two_polls_is_closed(run: Run, tmp_path: Path) -> None:
+    source = Serial(RTU, tmp_path / "line")
+    with source:
+        meter = device(source.url, read("holding_registers", 0, 1), interval=3600)
+        appliance = run(configuration({"meter": meter}))
+        wire.until(lambda: counters(appliance, "meter")["reads"] == 1, "it is read")
+        terminal = str(source.terminal.device.resolve())
+        assert terminal in open_files()
+    # The next adapter gets its name only when nobody has it open. Others may have it by now.
+    wire.until(
+        lambda: not any(file.startswith(f"{terminal} (deleted)") for file in open_files()),
+        "the line is closed",
+    )
+
+
+def open_files() -> list[str]:
+    """The files that this process has open."""
+    files = []
+    for entry in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # It was closed meanwhile.
+            files.append(str(entry.readlink()))
+    return files
 
 
 @pytest.mark.parametrize("kind", ["tcp", "rtu+tcp", "ascii+tcp"])
@@ -693,7 +720,6 @@ def test_a_unit_that_waits_too_long_for_its_turn_is_out_of_date(run: Run) -> Non
 def test_units_of_a_serial_line_are_polled_in_turn_with_a_dead_one(
     run: Run, tmp_path: Path
 ) -> None:
-    from support.lines import RTU
     from support.lines import configuration as serving
 
     with Cable(tmp_path) as cable:

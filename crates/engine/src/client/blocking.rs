@@ -325,6 +325,17 @@ impl BlockingClient {
         lock(&self.state).end();
     }
 
+    /// Closes an idle connection whose device is gone.
+    pub(crate) fn close_if_lost(&self) {
+        let mut state = lock(&self.state);
+        let Some(open) = &mut state.open else { return };
+        let received = open.receive_waiting(&mut [0; CHUNK_BYTES], &mut |_| {});
+        open.count_strays(&self.strays);
+        if received.is_err() || open.connection.closed().is_some() {
+            state.end();
+        }
+    }
+
     /// What came without a request, or late.
     pub fn strays(&self) -> &Arc<StrayCounters> {
         &self.strays

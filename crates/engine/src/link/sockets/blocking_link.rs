@@ -1,7 +1,8 @@
 //! A link that sends one request at a time, by blocking calls in a thread that ends with the link.
 
 use std::cell::Cell;
-use std::sync::{Arc, mpsc};
+use std::sync::Arc;
+use std::sync::mpsc::{self, RecvTimeoutError};
 use std::time::Duration;
 
 use holdfast_protocol::client::Closed;
@@ -18,6 +19,10 @@ use crate::link::limits::connect_pause::ConnectPause;
 use crate::link::limits::flood::Flood;
 use crate::link::limits::lease_fence::Pass;
 use crate::link::limits::permit::Permit;
+
+/// How often an idle serial line is looked at: the system gives the name of a lost adapter to the next one
+/// only when nobody has it open.
+const LINE_CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
 pub(in crate::link) struct BlockingLink {
     jobs: mpsc::Sender<Job>,
@@ -53,11 +58,14 @@ impl BlockingLink {
             // While there may be a connection.
             let mut pass: Option<Pass> = None;
             let flood = (!is_line).then(|| Flood::new(counted, retry));
-            for job in queue {
-                match job {
+            let idle = if is_line { LINE_CHECK_INTERVAL } else { Duration::MAX };
+            loop {
+                match queue.recv_timeout(idle) {
+                    Err(RecvTimeoutError::Disconnected) => return,
+                    Err(RecvTimeoutError::Timeout) => client.close_if_lost(),
                     // A stopped device no longer waits for its read.
-                    Job::Call(call) if call.answer.is_closed() => {}
-                    Job::Call(call) => {
+                    Ok(Job::Call(call)) if call.answer.is_closed() => {}
+                    Ok(Job::Call(call)) => {
                         if let Some(fence) = &call.permit.fence {
                             pass.get_or_insert_with(|| fence.pass());
                         }
@@ -69,7 +77,7 @@ impl BlockingLink {
                         }
                         let _ = call.answer.send((answer, pause.until()));
                     }
-                    Job::Release => {
+                    Ok(Job::Release) => {
                         client.close(None);
                         pass = None;
                     }
