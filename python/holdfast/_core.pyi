@@ -1604,9 +1604,10 @@ class Poller:
 
         `of` selects the devices whose polls this receiver takes; `None` selects all.
 
-        `age` is the age of the last valid reply, `None` before the first. `plan_error` is the
-        reason why the device has no plan, `None` if it has one. `unplanned` counts polls skipped
-        without a plan, `unstored` counts reads and status blocks that memory refused.
+        `error` is the text of `last_error`, `None` if no request has failed so. `age` is the age of
+        the last valid reply, `None` before the first. `plan_error` is the reason why the device has
+        no plan, `None` if it has one. `unplanned` counts polls skipped without a plan, `unstored`
+        counts reads and status blocks that memory refused.
         """
 
     def stop(self) -> None:

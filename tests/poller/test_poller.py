@@ -1110,11 +1110,14 @@ def test_a_change_of_health_is_logged_once(run: Run, records: web.Records) -> No
         until_logged(3)
     first, second, third = records.of("device_health")
     assert first == {"event": "device_health", "device": "meter", "health": "ok"}
-    assert (second["health"], second["error"], second["failures"] > 0) == (
-        "error",
-        "exception 04",
-        True,
-    )
+    assert second.pop("failures") > 0
+    assert second == {
+        "event": "device_health",
+        "device": "meter",
+        "health": "error",
+        "error": "exception 04",
+        "reason": "exception 0x04",
+    }
     assert third == first
     levels = [line.split()[0] for line in records.lines if "device_health" in line]
     assert levels == ["INFO", "WARNING", "INFO"]

@@ -417,6 +417,7 @@ fn state<'py>(py: Python<'py>, state: &DeviceState) -> PyResult<Bound<'py, PyDic
     let shown = PyDict::new(py);
     shown.set_item("health", state.health().name())?;
     shown.set_item("last_error", state.last_error())?;
+    shown.set_item("error", state.error())?;
     shown.set_item("seconds_in_error", state.in_error().as_secs_f64())?;
     shown.set_item("age", state.age().map(|age| age.as_secs_f64()))?;
     shown.set_item("failures", state.failures())?;

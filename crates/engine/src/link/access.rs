@@ -1,6 +1,6 @@
 //! A link as the poller uses it: its requests, in turns with those of others.
 
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use holdfast_runtime::Retry;
 use tokio::time::Instant;
 
 use super::fault::{Answer, Exchanged, Fault, fault};
-use crate::client::{Endpoint, Place, StrayCounters};
+use crate::client::{ClientError, Endpoint, Place, StrayCounters};
 use crate::link::limits::permit::Permit;
 use crate::link::scheduling::in_flight::{Alone, InFlight, Pace, Place as Turn};
 use crate::link::scheduling::queue::Priority;
@@ -25,6 +25,8 @@ pub(crate) struct Link {
     pub(super) wire: Wire,
     /// When an address that cannot be reached, or a unit that does not answer, is tried again.
     pub(crate) retry: Retry,
+    /// Why the last request of the poller that failed did.
+    error: RefCell<Option<Arc<ClientError>>>,
     /// Grows whenever a device may have changed by a request.
     pub(super) changes: Cell<u64>,
 }
@@ -47,7 +49,8 @@ impl Link {
             }
             _ => (Wire::Blocking(BlockingLink::new(endpoint, retry)), one),
         };
-        Rc::new(Link { pace: Pace::new(in_flight), wire, retry, changes: Cell::default() })
+        let (pace, error, changes) = (Pace::new(in_flight), RefCell::default(), Cell::default());
+        Rc::new(Link { pace, wire, retry, error, changes })
     }
 
     /// Sends a request of the poller when it is its turn, and waits for the answer. `timeout` does not
@@ -70,7 +73,16 @@ impl Link {
         };
         let eager = priority == Priority::Urgent;
         let answer = self.exchange(unit_id, request, timeout, eager, permit).await;
-        answer.map_err(|error| fault(&error))
+        answer.map_err(|error| {
+            let fault = fault(&error);
+            self.error.replace(Some(error));
+            fault
+        })
+    }
+
+    /// Why the last [`call`](Link::call) that failed did.
+    pub(crate) fn error(&self) -> Option<Arc<ClientError>> {
+        self.error.borrow().clone()
     }
 
     /// As [`call`](Link::call), for a read and then the write that `write` makes of its answer. No other

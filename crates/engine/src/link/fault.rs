@@ -127,7 +127,7 @@ pub(super) type Exchanged = Result<Vec<u8>, Arc<ClientError>>;
 pub(super) const FLOODED: ClientError = ClientError::Invalid(InvalidResponse::Flood);
 
 /// The fault that a failed request counts as.
-pub(super) fn fault(error: &ClientError) -> Fault {
+pub(crate) fn fault(error: &ClientError) -> Fault {
     match error {
         ClientError::Exception(code) => Fault::Exception(*code),
         ClientError::Timeout(_)

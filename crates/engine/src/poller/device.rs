@@ -637,6 +637,9 @@ impl Device {
         if fence.is_some_and(|fence| !fence.allows()) {
             return Err(Fault::Standby);
         }
+        if answer.is_err() {
+            self.state.set_error(self.link.error());
+        }
         match &answer {
             Ok(_) => {
                 let took = began.elapsed();

@@ -8,9 +8,9 @@ use holdfast_runtime::{Counter, lock};
 
 use super::health::Health;
 use super::status::Status;
-use crate::client::StrayCounters;
+use crate::client::{ClientError, StrayCounters};
 use crate::counter::counters;
-use crate::link::Fault;
+use crate::link::{Fault, fault};
 
 /// Counters and health of a device.
 #[derive(Debug, Default)]
@@ -27,6 +27,8 @@ pub struct DeviceState {
     requests_per_poll: AtomicU32,
     since: Mutex<Times>,
     plan_error: Mutex<Option<String>>,
+    /// Why the last request that failed did.
+    error: Mutex<Option<Arc<ClientError>>>,
     /// Whether a memory has refused something since the last poll.
     unstored: AtomicBool,
     /// Whether a task of the device has panicked since the device was created or replaced.
@@ -90,6 +92,16 @@ impl DeviceState {
             return Fault::Internal.code();
         }
         self.last_error.load(Ordering::Relaxed)
+    }
+
+    /// The error behind [`last_error`](DeviceState::last_error), if it is of a request.
+    pub fn error(&self) -> Option<String> {
+        let error = lock(&self.error).clone()?;
+        (fault(&error).code() == self.last_error()).then(|| error.to_string())
+    }
+
+    pub(super) fn set_error(&self, error: Option<Arc<ClientError>>) {
+        *lock(&self.error) = error;
     }
 
     /// Why the device has no plan.

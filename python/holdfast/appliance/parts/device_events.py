@@ -67,6 +67,8 @@ class DeviceEvents:
             if health == "error":
                 error = fault_word(counted["last_error"])
                 fields |= {"error": error, "failures": counted["failures"]}
+                if counted["error"] is not None:
+                    fields["reason"] = counted["error"]
             usual = health in ("ok", "standby")
             log_lines.write(logging.INFO if usual else logging.WARNING, "device_health", **fields)
         self.log_strays("device", name, counted)
