@@ -1003,6 +1003,17 @@ def test_stop_ends_it_also_with_connections_that_are_open(start: Start, connect:
         wire.until(lambda: service.supervisor.status()["state"] == "stopped", "stopped")
 
 
+def test_stop_does_not_wait_for_the_rest_of_a_request(start: Start) -> None:
+    service = start(stop_timeout=1000)
+    request = web.post(GOOD, "Expect: 100-continue")
+    with wire.Connection(service.address) as half:
+        half.send(request[: request.index(b"\r\n\r\n") + 4])
+        go_on = b"HTTP/1.1 100 Continue\r\n\r\n"
+        assert half.socket.recv(len(go_on)) == go_on, "it waits for the body"
+        service.supervisor.stop()
+        wire.until(lambda: service.supervisor.status()["state"] == "stopped", "stopped")
+
+
 def test_it_runs_again_on_the_same_socket(memories: dict[str, holdfast.Memory]) -> None:
     service = web.Service(memories)
     with contextlib.closing(service.listener):

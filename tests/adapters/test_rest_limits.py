@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import json
 import os
@@ -772,6 +773,7 @@ def test_many_come_and_go(service: web.Service, connect: Connect) -> None:
 @pytest.mark.skipif(not os.path.isdir("/proc/self/fd"), reason="needs /proc")  # noqa: PTH112
 def test_stopping_leaves_nothing_open() -> None:
     def held() -> int:
+        gc.collect()  # The error of a request that was cut off holds its frames, and they hold it.
         return len(os.listdir("/proc/self/fd"))  # noqa: PTH208
 
     before = held()

@@ -174,9 +174,12 @@ pub(super) async fn converse(
                 continue;
             };
             if stops_now {
-                if !shared.lock().is_busy() {
+                let line = shared.lock();
+                // The peer may never send the rest.
+                if !line.is_busy() || line.lacks_rest() {
                     return Poll::Ready(End::Idle);
                 }
+                drop(line);
                 connection.as_mut().graceful_shutdown();
             }
             if let Poll::Ready(ended) = connection.as_mut().poll(context) {

@@ -178,6 +178,11 @@ impl Line {
         matches!(self.answer, Answer::Awaited | Answer::Begun)
     }
 
+    /// Whether the handler waits for the rest of the request.
+    pub(super) fn lacks_rest(&self) -> bool {
+        self.answer == Answer::Awaited && self.is_asked && !self.portion.is_over()
+    }
+
     /// Whether it waits for the next request, and nothing else is left to do.
     pub(super) fn is_idle(&self) -> bool {
         self.idle_due.is_some() && self.unsent.is_empty()

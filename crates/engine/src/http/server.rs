@@ -190,8 +190,8 @@ impl HttpServer {
         }
     }
 
-    /// Accepts no more connections, and ends those that have no request. The others end after their
-    /// responses.
+    /// Accepts no more connections, and ends those that have no request, or only a part of one. The
+    /// others end after their responses.
     pub fn end(&self) {
         self.stop.send_replace(true);
     }
