@@ -348,6 +348,17 @@ def test_with_sync_above_0_a_memory_goes_on_without_its_disk(plant: Plant) -> No
         assert again.memories["plant"].read("holding_registers", 3, 1) == [8]
 
 
+@pytest.mark.parametrize("plant", [3600], indirect=True)
+def test_writes_that_the_stop_can_not_store_are_counted(plant: Plant) -> None:
+    for _ in range(3):
+        assert plant.modbus("0600030007") == "0600030007"
+    plant.disk(full=True)
+    code, log = plant.command.end(signal.SIGTERM)
+    assert code == 1
+    assert f" error memory_file_lost file={plant.file.with_name('plant.redb')} writes=3" in log
+    assert " info stopped" in log
+
+
 def test_a_mirror_is_kept_too(tmp_path: Path) -> None:
     source = holdfast.Memory(holding_registers=10)
     with holdfast.Server({1: source}, bind="127.0.0.1:0", access="read-write") as device:

@@ -194,6 +194,7 @@ def test_a_stalled_thread_starves_the_watchdog(monkeypatch: pytest.MonkeyPatch) 
         def __init__(self, _: object, **_more: object) -> None:
             self.live = iter([True, False, True])
             self.is_live = False
+            self.lost_writes = 0
 
         def start(self) -> None:
             steps.append("start")

@@ -77,6 +77,8 @@ class Appliance:
         self.memories = {name: created(config, name) for name in config.memories}
         self._running: _Running | None = None
         self._was_started = False
+        self.lost_writes = 0
+        """The confirmed writes to memories that the last stop could not store."""
 
     def start(self) -> Self:
         """Binds the listeners and serves. Raises `RuntimeError` if already running."""
@@ -102,6 +104,7 @@ class Appliance:
         running, self._running = self._running, None
         if running is not None:
             running.stop()
+            self.lost_writes = running.memories.lost_writes
             log_lines.write(logging.INFO, "stopped")
 
     def reload(self, config: Config) -> list[str]:

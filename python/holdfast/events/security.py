@@ -61,8 +61,8 @@ _MEANINGS: Mapping[tuple[str, str, Outcome], str] = {
     ("process", "info", "unknown"): "held_back",
     ("file", "change", "success"): "memory_file_back audit_back audit_copies_back",
     ("file", "change", "failure"): """
-        memory_file_failing audit_failed audit_lost audit_not_rotated audit_copy_failed
-        audit_copies_lost""",
+        memory_file_failing memory_file_lost audit_failed audit_lost audit_not_rotated
+        audit_copy_failed audit_copies_lost""",
     ("host", "change", "unknown"): "clock_stepped",
 }
 """The events by category, type and outcome."""

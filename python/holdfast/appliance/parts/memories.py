@@ -34,6 +34,10 @@ class Memories(Part):
         self._files: dict[Path, _core.MemoryFile] = {}
         self._of_logs: dict[str, Path] = {}
         self._failing: dict[Path, str | None] = {}
+        self._only_copies: set[Path] = set()
+        """Files that are written: what they lack is lost, unlike in those of logs."""
+        self.lost_writes = 0
+        """The confirmed writes that could not be stored when the files were closed."""
 
     def open(self, plan: Plan) -> None:
         """Loads the contents of the memories. Raises the `OSError`s of `MemoryFile`."""
@@ -71,7 +75,7 @@ class Memories(Part):
         members = [(name, memories[name]) for name in names]
         file = _core.MemoryFile(str(path), members, keep.sync, of_log=replicate is not None)
         self._files[path] = file
-        self.closing.callback(_close, path, file)
+        self.closing.callback(self._close, path, file)
         for warning in file.warnings:
             log_lines.write(logging.WARNING, "memory_file_differs", file=path, warning=warning)
         for name in names:
@@ -79,10 +83,22 @@ class Memories(Part):
                 fill(memories[name], self.config.memories[name])
         if replicate is None:
             file.start()
+            self._only_copies.add(path)
         else:
             self._of_logs[replicate.log] = path
         loaded = ",".join(file.loaded) or "-"
         log_lines.write(logging.INFO, "memory_file", file=path, loaded=loaded, sync=keep.sync)
+
+    def _close(self, path: Path, file: _core.MemoryFile) -> None:
+        """Stores pending writes."""
+        try:
+            file.stop()
+        except OSError as error:
+            log_lines.write(logging.ERROR, "memory_file_failing", file=path, error=error)
+            lost = file.status()["pending"]
+            if lost and path in self._only_copies:
+                self.lost_writes += lost
+                log_lines.write(logging.ERROR, "memory_file_lost", file=path, writes=lost)
 
     def of_log(self, log: str) -> Path | None:
         """The file of the memories of a log."""
@@ -143,14 +159,6 @@ def fill(made: Memory, settings: MemoryConfig) -> None:
     writes = [(run.area, run.address, run.values) for run in settings.initial_values]
     if writes:
         made.write_many(writes)
-
-
-def _close(path: Path, file: _core.MemoryFile) -> None:
-    """Stores pending writes."""
-    try:
-        file.stop()
-    except OSError as error:
-        log_lines.write(logging.ERROR, "memory_file_failing", file=path, error=error)
 
 
 def _files_of(config: Config) -> dict[Path, list[str]]:

@@ -74,8 +74,9 @@ def run(file: Path) -> None:
     """Run the appliance with the configuration FILE.
 
     Prints listeners and polled devices, then serves until Ctrl-C or SIGTERM. Exit codes: 0 stopped
-    by a signal, 1 another start may succeed, as with a port that was taken, 2 the configuration or
-    a file has errors. The ports of REST, gateway and metrics are retried until they are free.
+    by a signal, 1 another start may succeed, as with a port that was taken, or the stop could not
+    store confirmed writes, 2 the configuration or a file has errors. The ports of REST, gateway and
+    metrics are retried until they are free.
     """
     config = load_or_exit(file)
     serve(config, lambda appliance: _greeting(appliance, file), named=str(file), file=file)
@@ -91,7 +92,8 @@ def serve(
     retries_ports: bool = True,
     control: ServiceControl | None = None,
 ) -> None:
-    """Runs an appliance until a signal. Exits with 1 or 2 if it can't start.
+    """Runs an appliance until a signal. Exits with 1 or 2 if it can't start, and with 1 if the stop
+    could not store confirmed writes.
 
     With `file`, it is reread at SIGHUP, at a request of `holdfast reload`, or when it changes. With
     `load`, what it returns is taken over at SIGHUP. Without `retries_ports`, a port of HTTP that is
@@ -145,6 +147,8 @@ def serve(
                 manager.feed_watchdog()
             if reloading is not None:
                 reloading.step(requested=signals.take_reload())
+    if appliance.lost_writes:
+        sys.exit(ExitCode.FAILED)
 
 
 def _control(appliance: Appliance, reloading: Reloader, file: Path) -> Callable[[], object]:
