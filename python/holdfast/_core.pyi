@@ -474,12 +474,16 @@ class BatchRefused(ValueError):
         "mirrored",
         "stale",
         "not_one_step",
+        "busy",
+        "too_large",
         "not_stored",
         "log_unavailable",
         "not_confirmed",
     ]
     """`invalid_type`: a value of another type, or with `index` `None`, values that are not a
     sequence of integers. `invalid_value`: an integer out of range."""
+    detail: str
+    """The reason as a sentence. Only of refusals by the memory, or by what keeps it."""
 
 @final
 class Batch:

@@ -140,7 +140,8 @@ class MemoryFileStatus(TypedDict):
 
     `failing`: why contents can't be stored at present. `stored_at`: when they were last stored, in
     seconds since 1970. `commits`: transactions. `pending`: writes that wait to be stored.
-    `refused`: writes that were refused because they could not be stored. `bytes`: size of the file.
+    `refused`: writes that were refused because they could not be stored. `busy`: because too many
+    waited. `bytes`: size of the file.
     """
 
     failing: str | None
@@ -148,6 +149,7 @@ class MemoryFileStatus(TypedDict):
     commits: int
     pending: int
     refused: int
+    busy: int
     last_commit_seconds: float
     bytes: int
 

@@ -1,13 +1,16 @@
-"""Messages for a memory whose file can't be written."""
+"""Messages for a memory whose file or log does not take them."""
 
 from __future__ import annotations
 
+import json
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast._core import MemoryFile
+from holdfast._core import Log, MemoryFile
 from support import wire
+from support.brokers import NatsServer
 from support.mqtt_rig import Rig, command, subscription, text
 
 if TYPE_CHECKING:
@@ -44,3 +47,25 @@ def test_a_message_without_acknowledgement_is_lost(rig: Rig) -> None:
     running.wait_until_received(1)
     assert rig.memory_access.counts()["refused"] == {"log_unavailable": 1}
     assert running.status()["reconnects"] == 0
+
+
+def test_a_message_that_is_too_large_for_the_log_does_not_stop_those_behind_it(
+    tmp_path: Path,
+) -> None:
+    with Rig(tmp_path) as rig, ExitStack() as stack:
+        server = NatsServer(tmp_path)
+        stack.callback(server.kill)
+        log = Log("site", "a", [server.url], [("plant", rig.memory)], write_timeout=wire.DEADLINE)
+        stack.callback(log.stop)
+        log.start(wire.DEADLINE)
+        broker = rig.broker()
+        running = rig.connected(broker, subscription())
+        probe = rig.probe(broker)
+        probe.subscribe("answers")
+        too_large = text(*[command([1] * 1000)] * 530)
+        probe.publish("plant/ingest", too_large, ResponseTopic="answers")
+        probe.publish("plant/ingest", text(command([7])))
+        assert json.loads(probe.get().payload)["reason"] == "too_large"
+        wire.until(lambda: rig.registers(0, 1) == [7], "the next message is written")
+        assert rig.memory_access.counts()["refused"] == {"too_large": 1}
+        assert running.status()["reconnects"] == 0

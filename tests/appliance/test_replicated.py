@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import re
@@ -101,6 +102,23 @@ def test_a_write_to_one_node_is_read_from_all(node: Callable[..., Appliance]) ->
     assert ask(two, "16000300f0000f") == "16000300f0000f"
     assert ask(two, "0300030001") == "0302002f"
     wire.until(lambda: register(one) == 0x2F, "the first node has it")
+
+
+def test_a_batch_that_is_too_large_for_the_log_is_refused_for_good(
+    node: Callable[..., Appliance],
+) -> None:
+    one = node("a", holding_registers=65_536)
+    command = web.command("holding_registers", 0, [1] * 65_536, memory="plant")
+    with contextlib.closing(web.Client(endpoint(one, "rest"))) as client:
+        assert client.ingest([command] * 7).status == 200
+        refused = client.ingest([command] * 8)
+    assert (refused.status, refused.json["reason"]) == (413, "too_large")
+    sizes = re.fullmatch(
+        r"the step has (\d+) bytes, the log takes at most (\d+); nothing has changed",
+        refused.json["detail"],
+    )
+    assert sizes is not None
+    assert 2**21 > int(sizes[1]) > 2**20 > int(sizes[2])
 
 
 def test_files_and_queues_are_those_of_all_nodes(node: Callable[..., Appliance]) -> None:

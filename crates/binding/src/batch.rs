@@ -222,7 +222,9 @@ fn listed<'py>(values: &Bound<'py, PyAny>) -> PyResult<Option<Bound<'py, PyList>
 }
 
 fn refused(py: Python<'_>, Refused { index, refusal: because }: Refused) -> PyErr {
-    refusal(py, index, None, reason(because))
+    let error = refusal(py, index, None, reason(because));
+    let noted = error.value(py).setattr("detail", because.to_string());
+    noted.err().unwrap_or(error)
 }
 
 fn refusal(py: Python<'_>, command: usize, index: Option<usize>, reason: &'static str) -> PyErr {
@@ -249,6 +251,8 @@ pub(crate) const fn reason(refusal: Refusal) -> &'static str {
         Refusal::NotRegisters => "not_registers",
         // What is wrong with the log is in its status.
         Refusal::Unavailable | Refusal::Behind | Refusal::Differs => "log_unavailable",
+        Refusal::Busy => "busy",
+        Refusal::TooLarge { .. } => "too_large",
         Refusal::NotStored => "not_stored",
         Refusal::NotConfirmed => "not_confirmed",
         Refusal::NotOneStep => "not_one_step",

@@ -340,6 +340,8 @@ impl Range {
             }
             stale @ Refusal::Stale => Stale::new_err(stale.to_string()),
             journal @ (Refusal::Unavailable
+            | Refusal::Busy
+            | Refusal::TooLarge { .. }
             | Refusal::NotStored
             | Refusal::NotConfirmed
             | Refusal::Overtaken

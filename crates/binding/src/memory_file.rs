@@ -99,6 +99,7 @@ impl MemoryFile {
         shown.set_item("commits", status.commits)?;
         shown.set_item("pending", status.pending)?;
         shown.set_item("refused", status.refused)?;
+        shown.set_item("busy", status.busy)?;
         shown.set_item("last_commit_seconds", status.last_commit.as_secs_f64())?;
         shown.set_item("bytes", status.bytes)?;
         Ok(shown)

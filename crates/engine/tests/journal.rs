@@ -301,7 +301,13 @@ fn pipelined_writes_do_not_wait_for_each_other_and_reads_wait_for_them() {
 fn a_write_that_is_not_kept_is_refused() {
     let setup = Setup::new();
     let mut client = setup.connect(0);
-    let refusals = [(Refusal::Unavailable, 6), (Refusal::NotStored, 4), (Refusal::NotConfirmed, 4)];
+    let refusals = [
+        (Refusal::Unavailable, 6),
+        (Refusal::Busy, 6),
+        (Refusal::NotStored, 4),
+        (Refusal::TooLarge { bytes: 9, most: 8 }, 4),
+        (Refusal::NotConfirmed, 4),
+    ];
     for (refusal, code) in refusals {
         client.write_all(&frame(1, &[6, 0, 7, 0, 1])).unwrap();
         setup.refuse(refusal);
@@ -379,6 +385,8 @@ fn a_packet_that_is_not_confirmed_gets_no_reply() {
         for (refusal, reply) in [
             (Refusal::NotStored, &[1][..]),
             (Refusal::Unavailable, &[1]),
+            (Refusal::Busy, &[1]),
+            (Refusal::TooLarge { bytes: 9, most: 8 }, &[1]),
             (Refusal::NotConfirmed, &[]),
         ] {
             let mut sender = setup.connect(listener);

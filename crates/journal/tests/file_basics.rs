@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use holdfast_journal::file::{
-    Disk, FileError, FileOnDisk, MemoryFile, Options, read_from, release,
+    Disk, FileError, FileOnDisk, MemoryFile, Options, Status, read_from, release,
 };
 use holdfast_memory::{
     Access, Area, Freshness, Gate, GateMode, Layout, Memory, Mirrored, Read, Refusal, Span, Write,
@@ -214,13 +214,25 @@ fn the_queue_is_bounded_in_steps_and_bytes() {
         for (address, outcome) in (0..).zip(&coming) {
             // One refusal was received above.
             if usize::from(address) != full {
-                assert_eq!(outcome.recv().unwrap().is_ok(), usize::from(address) < full);
+                let refusal = outcome.recv().unwrap().err().map(|refused| refused.refusal);
+                assert_eq!(refusal, (usize::from(address) > full).then_some(Refusal::Busy));
             }
             assert_eq!(get(&one, address), u16::from(usize::from(address) < full));
         }
-        assert_eq!(file.status().refused, 1000 - full as u64);
+        let Status { busy, refused, failing, .. } = file.status();
+        assert_eq!((busy, refused, failing), (1000 - full as u64, 0, None));
         set(&one, 999, 1).unwrap();
     }
+}
+
+#[test]
+fn a_step_of_any_size_is_stored_when_no_other_waits() {
+    let one = memory(layout(0, 1000), None);
+    let options = Options { max_bytes: 1000, ..at_once() };
+    let _file = keep(&Arc::new(SimDisk::default()), &[("one", &one)], options).unwrap();
+    let write = Write { area: REGISTERS, address: 0, count: 1000, bytes: &[1; 2000] };
+    one.write(Access::Ingest, write).unwrap();
+    assert_eq!(get(&one, 999), 0x0101);
 }
 
 #[test]

@@ -36,6 +36,10 @@ pub enum Refusal {
     NotRegisters,
     #[error("what keeps the memory can't be reached, and nothing was written")]
     Unavailable,
+    #[error("too many writes wait to be stored, and this one was not carried out")]
+    Busy,
+    #[error("the step has {bytes} bytes, the log takes at most {most}")]
+    TooLarge { bytes: usize, most: usize },
     #[error("the write can't be stored, and was not carried out")]
     NotStored,
     #[error("the write was sent, but not confirmed: it may still be carried out")]

@@ -79,7 +79,8 @@ pub trait Journal: fmt::Debug + Send + Sync {
     /// also before this returns.
     ///
     /// Besides the refusals of a memory, the outcome may be [`Refusal::Unavailable`],
-    /// [`Refusal::NotStored`], [`Refusal::NotConfirmed`] or [`Refusal::Overtaken`].
+    /// [`Refusal::Busy`], [`Refusal::TooLarge`], [`Refusal::NotStored`], [`Refusal::NotConfirmed`] or
+    /// [`Refusal::Overtaken`].
     fn submit(&self, step: Step, done: Done);
 
     /// Whether [`Journal::admit`] is asked before each access: several nodes share the contents. It stays

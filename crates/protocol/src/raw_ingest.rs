@@ -109,6 +109,10 @@ codes! {
         NotStored = 13, "not_stored";
         /// The write was passed on, and not confirmed: it may still be carried out.
         NotConfirmed = 14, "not_confirmed";
+        /// Too many writes wait for what keeps them.
+        Busy = 15, "busy";
+        /// The write is larger than what keeps it takes.
+        TooLarge = 16, "too_large";
     }
 }
 

@@ -519,6 +519,8 @@ class MemoryAccess:
             case "not_one_step":
                 detail = f"{prefix(index)}{memory} and the memories before it are not kept together"
                 return Refused("not_one_step", f"{detail}, so no step writes all of them", **where)
+            case "too_large":
+                return Refused("too_large", f"{refused.detail}; nothing has changed", **where)
             case reason if reason in KEEPING:
                 return Refused(reason, KEEPING[reason], **where)
             case "invalid_value" | "invalid_type" if refused.index is not None:

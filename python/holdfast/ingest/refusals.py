@@ -42,11 +42,12 @@ class Refused(Exception):
 
 
 KEEPING = {
+    "busy": "too many writes wait to be stored; nothing has changed",
     "not_stored": "the file of the memory can't be written; nothing has changed",
     "log_unavailable": "the log of the memory can't be reached; nothing has changed",
     "not_confirmed": "the log did not confirm the write in time; it may still be carried out",
 }
-"""Why memories that are kept refuse writes."""
+"""Why memories that are kept refuse writes for now: a later attempt may succeed."""
 
 UNCERTAIN = ("device_refused", "internal_error")
 """Reasons with which a write may have been carried out all the same."""

@@ -34,7 +34,7 @@ pub struct Member {
 pub struct Options {
     /// Contents are stored after this time; with 0, before a write is answered.
     pub sync: Duration,
-    /// With `sync` 0: how many steps, and how many bytes of steps, may wait.
+    /// With `sync` 0: how many steps, and how many bytes of steps, may wait. One step always may.
     pub max_steps: usize,
     pub max_bytes: usize,
     /// How long after an I/O error the next attempt follows if there is no step.

@@ -129,7 +129,10 @@ impl Queue {
 
     /// Answers and counts steps that were not carried out.
     pub fn refuse(&self, steps: impl ExactSizeIterator<Item = Done>, refusal: Refusal) {
-        lock(&self.status).refused += steps.len() as u64;
+        let mut status = lock(&self.status);
+        let counter = if refusal == Refusal::Busy { &mut status.busy } else { &mut status.refused };
+        *counter += steps.len() as u64;
+        drop(status);
         for done in steps {
             done(Err(Refused { index: 0, refusal }));
         }
@@ -151,13 +154,15 @@ impl Journal for Queue {
             Phase::Stopping | Phase::Ended => Refusal::Unavailable,
             Phase::Running => {
                 let bytes = state.bytes + size(&step);
-                if state.waiting.len() < self.limits.steps && bytes <= self.limits.bytes {
+                let fits = state.waiting.len() < self.limits.steps && bytes <= self.limits.bytes;
+                // A step that is larger than the queue waits alone.
+                if fits || state.waiting.is_empty() {
                     state.bytes = bytes;
                     state.waiting.push(Waiting { step, done, since: Instant::now() });
                     drop(state);
                     return self.changed.notify_one();
                 }
-                Refusal::NotStored
+                Refusal::Busy
             }
         };
         drop(state);

@@ -15,6 +15,8 @@ pub struct Status {
     pub pending: u64,
     /// How many writes were refused because they could not be stored.
     pub refused: u64,
+    /// How many writes were refused because too many waited.
+    pub busy: u64,
     /// How long the last transaction took.
     pub last_commit: Duration,
     /// The size of the file.

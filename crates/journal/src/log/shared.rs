@@ -100,17 +100,19 @@ impl Journal for Shared {
         let mut bytes = Vec::new();
         encoding::encode(&step, &mut bytes);
         // The servers would end the connection: no later attempt could succeed either.
-        if bytes.len() > self.max_step_bytes.load(Ordering::Relaxed) {
+        let most = self.max_step_bytes.load(Ordering::Relaxed);
+        if bytes.len() > most {
             self.counters.not_stored.add();
-            return refuse(done, Refusal::NotStored);
+            return refuse(done, Refusal::TooLarge { bytes: bytes.len(), most });
         }
         let mut queue = lock(&self.queue);
         let fits =
             queue.steps.len() < MAX_QUEUE_STEPS && queue.bytes + bytes.len() <= MAX_QUEUE_BYTES;
         if !queue.open || !fits {
+            let refusal = if queue.open { Refusal::Busy } else { Refusal::Unavailable };
             drop(queue);
             self.counters.unavailable.add();
-            return refuse(done, Refusal::Unavailable);
+            return refuse(done, refusal);
         }
         queue.bytes += bytes.len();
         let until = Instant::now() + self.write_timeout;
@@ -379,6 +381,8 @@ pub(super) fn refuse_all(steps: Vec<Done>, refusal: Refusal, counted: &Counter) 
 mod tests {
     use std::sync::Arc;
 
+    use holdfast_memory::{Access, Action, Outcome};
+
     use super::*;
 
     #[test]
@@ -401,6 +405,25 @@ mod tests {
         assert_eq!(shared.admit(), Err(Refusal::Behind));
         shared.contact(shared.now());
         assert_eq!(shared.admit(), Ok(()));
+    }
+
+    #[test]
+    fn a_full_queue_is_busy_and_a_closed_one_unavailable() {
+        let shared = Shared::new(&Settings::new("site", "a", Vec::new()));
+        let refusal = || {
+            let (sender, receiver) = std::sync::mpsc::channel();
+            let (access, action) = (Access::Ingest, Action::Write(Vec::new()));
+            let done = Box::new(move |outcome: Outcome| drop(sender.send(outcome)));
+            shared.submit(Step { access, tenure: None, action }, done);
+            receiver.try_recv().ok().map(|outcome| outcome.unwrap_err().refusal)
+        };
+        assert_eq!(refusal(), Some(Refusal::Unavailable));
+        shared.open(usize::MAX);
+        for _ in 0..MAX_QUEUE_STEPS {
+            assert_eq!(refusal(), None);
+        }
+        assert_eq!(refusal(), Some(Refusal::Busy));
+        assert_eq!(shared.counters.unavailable.get(), 2);
     }
 
     #[test]

@@ -158,6 +158,7 @@ def _figures(
 MEMORY_FILE_COUNTERS = {
     "commits": ("memory_file_commits", "How often writes were stored on the disk."),
     "refused": ("memory_file_refused", "Writes refused because of the disk."),
+    "busy": ("memory_file_busy", "Writes refused because too many waited for the disk."),
 }
 MEMORY_FILE_GAUGES = {
     "is_failing": ("memory_file_failing", "1 if the file could not be written last time."),

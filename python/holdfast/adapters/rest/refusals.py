@@ -43,8 +43,8 @@ REFUSALS = Refusals(
         ("unrecorded", "not_stored", "log_unavailable", "stale", "busy", "withdrawn"),
         "The audit log, the file or the log of the memory can't be written, and nothing has "
         "changed; the range mirrors a device whose values are too old; too many change streams "
-        "are open, or too many writes wait for a device; or a write was not sent to its device, "
-        "because its client has gone or the service ends",
+        "are open, or too many writes wait for a device, the file or the log; or a write was not "
+        "sent to its device, because its client has gone or the service ends",
         "the audit log can't be written, and no write is carried out without a record",
     ),
     Refusal(
@@ -66,6 +66,7 @@ MEMORY = ("unknown_memory", "not_granted", "invalid_area", "out_of_range")
 
 VALUES = (
     "invalid_value",
+    "too_large",
     "mirrored",
     "device_refused",
     "busy",

@@ -121,6 +121,7 @@ _MEMORY_FILE = object_of(
         "commits": COUNT,
         "pending": count("Writes that are not on the disk"),
         "refused": count("Writes refused by the disk"),
+        "busy": count("Writes refused because too many waited for the disk"),
         "last_commit_seconds": NUMBER,
         "bytes": count("Size of the file"),
     }

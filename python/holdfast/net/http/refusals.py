@@ -53,7 +53,7 @@ COMMON = (
     Refusal(
         413,
         ("too_large",),
-        "The body is too large; the connection is closed",
+        "The body, or what it writes, is too large; the connection is closed",
         "the body has more than 65536 bytes",
     ),
 )

@@ -51,7 +51,7 @@ counters! {
         /// Memory of packets that are not complete, in bytes.
         held_bytes,
         ;
-        refused: [Counter; Refusal::NotConfirmed as usize + 1],
+        refused: [Counter; Refusal::TooLarge as usize + 1],
     }
 }
 

@@ -15,10 +15,11 @@ pub(in crate::server) fn exception_of(refusal: Refusal) -> ExceptionCode {
         }
         Refusal::WrongLength | Refusal::NotRegisters => ExceptionCode::IllegalDataValue,
         Refusal::Stale | Refusal::Overtaken => ExceptionCode::GatewayTargetFailedToRespond,
-        Refusal::Unavailable | Refusal::Behind => ExceptionCode::ServerDeviceBusy,
-        Refusal::NotStored | Refusal::NotConfirmed | Refusal::Differs => {
-            ExceptionCode::ServerDeviceFailure
-        }
+        Refusal::Unavailable | Refusal::Busy | Refusal::Behind => ExceptionCode::ServerDeviceBusy,
+        Refusal::TooLarge { .. }
+        | Refusal::NotStored
+        | Refusal::NotConfirmed
+        | Refusal::Differs => ExceptionCode::ServerDeviceFailure,
         Refusal::NotOneStep => unreachable!("a request writes to one memory"),
         Refusal::Unsealed => unreachable!("clients never restore"),
     }

@@ -676,7 +676,9 @@ impl RawIngest {
                 | Refusal::NotGranted
                 | Refusal::Range
                 | Refusal::Unrecorded
-                | Refusal::NotStored),
+                | Refusal::NotStored
+                | Refusal::Busy
+                | Refusal::TooLarge),
             ) if continues => {
                 self.refuse(context, peer, packet, refusal);
                 Ok(Some((len, REFUSED)))
@@ -809,6 +811,8 @@ fn refusal(refused: MemoryRefusal) -> Refusal {
         | MemoryRefusal::Behind
         | MemoryRefusal::Differs => Refusal::NotStored,
         MemoryRefusal::NotConfirmed => Refusal::NotConfirmed,
+        MemoryRefusal::Busy => Refusal::Busy,
+        MemoryRefusal::TooLarge { .. } => Refusal::TooLarge,
         _ => Refusal::Range,
     }
 }
