@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import re
 import signal
+import struct
 import threading
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -14,7 +16,7 @@ import pytest
 import holdfast
 from holdfast import values
 from holdfast.config.tag_files.read import load_tags
-from holdfast.discovery import segments
+from holdfast.discovery import device_search, segments
 from support import cli, sunspec_device, wire
 from support.cli import answer, done, usage_error
 from support.commands import Command
@@ -111,6 +113,56 @@ def test_a_device_that_ignores_unit_ids_is_described_once() -> None:
         found = answer("describe", device.url, "--units", "1-3", *QUICK)
     assert (found["ignores_unit"], found["answering"]) == (True, [1, 2, 3])
     assert [each["unit"] for each in found["units"]] == [1]
+
+
+def sunspec_from_0(pdu: bytes) -> bytes:
+    content = sunspec_device.registers(sunspec_device.common(), sunspec_device.inverter())
+    first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+    if pdu[0] != 3:
+        return exception(pdu, 1)
+    if first + count > len(content):
+        return exception(pdu, 2)
+    return bytes([3, 2 * count]) + struct.pack(f">{count}H", *content[first : first + count])
+
+
+def test_range_quantity_and_delay_are_those_of_every_request(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    waits: list[float] = []
+    monkeypatch.setattr(device_search, "pause", waits.append)
+    monkeypatch.setattr(time, "sleep", waits.append)
+    options = ("--range", "0-79", "--max-quantity", "10", "--delay", "300ms")
+    with FakeDevice(sunspec_from_0) as device:
+        found = answer("describe", device.url, "--units", "1", *QUICK, *options)
+    assert waits == [0.3] * (len(device.asked) - 1)
+    reads = [(pdu[1:3], pdu[3:5]) for pdu in device.asked if pdu[0] == 3]
+    assert max(int.from_bytes(first) + int.from_bytes(count) for first, count in reads) == 80
+    assert max(int.from_bytes(count) for _, count in reads) == 10
+    [unit] = found["units"]
+    assert [each["id"] for each in unit["sunspec"]["models"]] == [1]
+    ends = {each["name"]: each["address"] for each in unit["tags"]}
+    assert ends["common_Mn"] == 4
+    assert max(ends.values()) < 80
+
+
+@pytest.mark.parametrize(("limit", "models"), [(1, []), (5, [1]), (40, [1, 103])])
+def test_every_request_to_a_unit_id_counts(limit: int, models: list[int]) -> None:
+    options = ("--units", "1", *QUICK, "--max-requests", str(limit))
+    with FakeDevice(sunspec_from_0) as device:
+        found = answer("describe", device.url, *options, code=1)
+    asking = 3  # Whether the unit id answers, and who it is.
+    assert len(device.asked) == asking + limit
+    assert found["detail"] == f"stopped after {limit} requests; --max-requests sets the limit"
+    sunspec = found["units"][0]["sunspec"]
+    assert [each["id"] for each in (sunspec or {"models": []})["models"]] == models
+
+
+def test_readings_after_the_search_count_towards_the_limit() -> None:
+    with FakeDevice(small) as device:
+        options = ("--units", "1", "--areas", "hr", "--range", "0-0", "--every", "0.01")
+        found = answer("describe", device.url, *options, "--max-requests", "3", code=1)
+    assert len([pdu for pdu in device.asked if pdu[0] == 3]) == 1 + 3
+    assert [each["name"] for each in found["units"][0]["tags"]] == ["hr_0"]
 
 
 def test_invalid_replies_are_told_apart_from_silence() -> None:

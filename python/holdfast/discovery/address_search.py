@@ -253,6 +253,8 @@ class Survey:
         """The addresses that are read first in each area."""
         self._answered: Probe | None = None
         self._unanswered = 0
+        self._others = 0
+        """Requests that were counted by `count_request`."""
 
     @property
     def at(self) -> int:
@@ -267,7 +269,7 @@ class Survey:
     @property
     def requests(self) -> int:
         """How many requests were sent."""
-        return sum(found.requests for found in self.areas)
+        return self._others + sum(found.requests for found in self.areas)
 
     @property
     def is_done(self) -> bool:
@@ -337,13 +339,21 @@ class Survey:
 
     def ask(self, found: AreaMap, probe: Probe) -> Steps[Outcome]:
         """Sends a request, if that is allowed."""
-        if self.requests == self.max_requests:
-            raise LimitReached(f"stopped after {self.requests} requests")
+        self._check_limit()
         outcome = yield probe
         found.requests += 1
         if not isinstance(outcome, str):
             self._answered, self._unanswered = probe, 0
         return outcome
+
+    def count_request(self) -> None:
+        """Counts a request of the caller. Raises `LimitReached` if it must not be sent."""
+        self._check_limit()
+        self._others += 1
+
+    def _check_limit(self) -> None:
+        if self.requests == self.max_requests:
+            raise LimitReached(f"stopped after {self.requests} requests")
 
     def _look_whether_it_is_there(self, found: AreaMap) -> Steps[None]:
         assert self._answered is not None

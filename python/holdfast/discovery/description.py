@@ -10,13 +10,11 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 from holdfast.discovery import (
     address_search,
     byte_order_habits,
-    device_search,
     segments,
     sunspec,
     sunspec_tags,
@@ -72,6 +70,7 @@ class Description:
     unit: int
     survey: Survey
     identity: Identity = field(default_factory=Identity)
+    """As `device_search` has found it."""
     sunspec: SunSpec | None = None
     reads: dict[tuple[Area, range], list[list[int]]] = field(default_factory=dict)
     """The contents of each range that was read, of every read."""
@@ -95,19 +94,37 @@ def describe(
 ) -> None:
     """Carries out a description. Call `conclude` after it, also if an exception ended it early.
 
+    Waits `delay` seconds before every request. All of them count towards the `max_requests` of the
+    survey, and none is outside its span.
+
     Raises `ModbusError` if the device is silent, and `Unfinished` of the survey.
     """
-    found.identity = device_search.identify(client, found.unit)
-    if any(each.area == "holding_registers" for each in found.survey.areas):
-        found.sunspec = sunspec.find(partial(client.read_holding_registers, unit=found.unit))
+    survey = found.survey
 
-    def read(area: Area, address: int, kind: str) -> None:
+    def read(area: Area, address: int, kind: str) -> list[int]:
+        if delay:
+            time.sleep(delay)
         content: list[int] = client.read(area, address, kind, unit=found.unit)
+        return content
+
+    def read_more(area: Area, address: int, kind: str) -> list[int]:
+        survey.count_request()
+        return read(area, address, kind)
+
+    def read_sunspec(address: int, count: int) -> list[int]:
+        most = survey.max_quantity or READ_LIMITS["holding_registers"]
+        extent = range(address, address + count)
+        return list(_contents(read_more, "holding_registers", extent, most))
+
+    def search(area: Area, address: int, kind: str) -> None:
+        content = read(area, address, kind)
         found.seen.setdefault(area, {}).update(enumerate(content, address))
 
-    address_search.run_sync(found.survey, read, progress, delay=delay)
+    if any(each.area == "holding_registers" for each in survey.areas):
+        found.sunspec = sunspec.find(read_sunspec, survey.span)
+    address_search.run_sync(survey, search, progress)
     if progress is not None:
-        progress(found.survey)
+        progress(survey)
     places = list(_places(found))
     for turn in range(reads):
         if turn and places:
@@ -116,7 +133,7 @@ def describe(
             if (area, extent) in found.unread:
                 continue
             try:
-                content = list(_contents(client, found.unit, area, extent, largest, delay))
+                content = list(_contents(read_more, area, extent, largest))
             except ModbusException as error:
                 found.unread[area, extent] = str(error)
                 found.reads.pop((area, extent), None)
@@ -140,15 +157,13 @@ def _places(found: Description) -> Iterator[tuple[Area, range, int]]:
 
 
 def _contents(
-    client: SyncClient, unit: int, area: Area, extent: range, largest: int, delay: float
+    read: Callable[[Area, int, str], list[int]], area: Area, extent: range, largest: int
 ) -> Iterator[int]:
     kind = "bool" if area in BIT_AREAS else "uint16"
     step = min(largest, READ_LIMITS[area])
     for first in range(extent.start, extent.stop, step):
-        if delay:
-            time.sleep(delay)
         count = min(step, extent.stop - first)
-        yield from client.read(area, first, f"{kind}[{count}]", unit=unit)
+        yield from read(area, first, f"{kind}[{count}]")
 
 
 def conclude(found: Description, now: float | None = None, seconds: float | None = None) -> None:

@@ -207,12 +207,12 @@ def _unreachable(error: ConnectFailed) -> State:
 def units(client: SyncClient, unit_ids: Iterable[int], *, delay: float = 0.0) -> Iterator[Unit]:
     """Asks unit ids one by one, and yields each. Raises `ConnectFailed`."""
     for count, unit in enumerate(unit_ids):
-        if count and delay:
+        if count:
             pause(delay)
-        yield probe(client, unit)
+        yield probe(client, unit, delay=delay)
 
 
-def probe(client: SyncClient, unit: int) -> Unit:
+def probe(client: SyncClient, unit: int, *, delay: float = 0.0) -> Unit:
     """Asks one unit id. Raises `ConnectFailed`."""
     try:
         client.read("holding_registers", 0, "uint16", unit=unit)
@@ -226,15 +226,16 @@ def probe(client: SyncClient, unit: int) -> Unit:
     except ModbusError as error:
         is_garbled = isinstance(error, InvalidResponse)
         return Unit(unit, answers=False, detail=str(error), is_garbled=is_garbled)
-    return Unit(unit, answers=True, detail=detail, identity=identify(client, unit))
+    return Unit(unit, answers=True, detail=detail, identity=_identify(client, unit, delay))
 
 
-def identify(client: SyncClient, unit: int) -> Identity:
+def _identify(client: SyncClient, unit: int, delay: float) -> Identity:
     """What a device says about itself, by function 43/14, else 17."""
+    pause(delay)
     try:
         return identity(client.identify(unit=unit))
     except ModbusError:
-        pass
+        pause(delay)
     try:
         return server_identity(client.report_server_id(unit=unit))
     except ModbusError:
@@ -255,7 +256,9 @@ def server_identity(answer: ServerId) -> Identity:
     return Identity((("server_id", text),)) if len(text) >= 3 else Identity()
 
 
-def ignores_unit(client: SyncClient, asked: Sequence[Unit], *, is_line: bool) -> bool:
+def ignores_unit(
+    client: SyncClient, asked: Sequence[Unit], *, is_line: bool, delay: float = 0.0
+) -> bool:
     """Whether a device probably ignores the unit id: it answers all, also a rare one.
 
     On a line, each unit id is a device of its own.
@@ -265,5 +268,7 @@ def ignores_unit(client: SyncClient, asked: Sequence[Unit], *, is_line: bool) ->
     # With all unit ids of the standard asked, there is no rare one left to ask.
     if len(asked) >= MAX_SERIAL_UNIT:
         return True
-    is_left = all(unit.unit != UNUSUAL_UNIT for unit in asked)
-    return is_left and probe(client, UNUSUAL_UNIT).answers
+    if any(unit.unit == UNUSUAL_UNIT for unit in asked):
+        return False
+    pause(delay)
+    return probe(client, UNUSUAL_UNIT, delay=delay).answers

@@ -139,16 +139,19 @@ class SunSpec:
         return range(self.base, stop + 2 if self.is_complete else stop)
 
 
-def find(read: Read) -> SunSpec | None:
-    """Looks for `SunS`, and reads all models.
+def find(read: Read, span: range = range(ADDRESSES)) -> SunSpec | None:
+    """Looks for `SunS`, and reads all models that end within a span of addresses.
 
-    Raises `ConnectFailed`, and `ModbusError` if the device answers at none of the places.
+    Raises `ConnectFailed`, `ModbusError` if the device answers at none of the places, and other
+    errors of `read` than those of a device.
     """
     silences: list[ModbusError] = []
     for base in BASES:
+        if base not in span or base + len(MARK) > span.stop:
+            continue
         try:
             if read(base, len(MARK)) == MARK:
-                return _models(read, base)
+                return _models(read, base, span.stop)
         except ModbusException:
             continue
         except UNANSWERED as error:
@@ -160,22 +163,22 @@ def find(read: Read) -> SunSpec | None:
     return None
 
 
-def _models(read: Read, base: int) -> SunSpec:
+def _models(read: Read, base: int, stop: int) -> SunSpec:
     models: list[Model] = []
     at = base + len(MARK)
-    while len(models) < MAX_MODELS and at + 2 <= ADDRESSES:
+    while len(models) < MAX_MODELS and at + 2 <= stop:
         try:
             number, length = read(at, 2)
             if number == END:
                 return SunSpec(base, tuple(models), is_complete=True)
-            if not length or at + 2 + length > ADDRESSES:
+            if not length or at + 2 + length > stop:
                 break  # No model is empty: these are not headers of models.
             known = str(number) in definitions()
             registers = _block(read, at + 2, length) if known else []
             models.append(_model(number, at, length, registers))
         except ConnectFailed:
             raise
-        except (ModbusException, *UNANSWERED):
+        except ModbusError:  # Also the limit of requests: the models before it are complete.
             break
         at += 2 + length
     return SunSpec(base, tuple(models), is_complete=False)

@@ -188,11 +188,11 @@ class _Run:
         """The error of the first file that could not be written."""
 
     @property
-    def _answering(self) -> list[int]:
-        return [each.unit for each in self._seen if each.answers]
+    def _answering(self) -> list[Unit]:
+        return [each for each in self._seen if each.answers]
 
     @property
-    def _to_describe(self) -> list[int]:
+    def _to_describe(self) -> list[Unit]:
         return self._answering[:1] if self._ignores else self._answering
 
     def carry_out(self, client: SyncClient, *, is_line: bool) -> Ended | None:
@@ -202,9 +202,10 @@ class _Run:
         self._report.text(*lines)
         if why is not None:
             return why
-        for number in self._to_describe:
-            client.unit = number
-            unit = _UnitReport(Description(number, planned(self._plan.settings)), self._report)
+        for each in self._to_describe:
+            client.unit = each.unit
+            found = Description(each.unit, planned(self._plan.settings), each.identity)
+            unit = _UnitReport(found, self._report)
             self._found.append(unit.found)
             why = self._conclude(unit, self._attempt(partial(self._describe, unit, client)))
             if why is not None:
@@ -218,7 +219,7 @@ class _Run:
 
     def end(self, why: Ended | None) -> None:
         """Prints what is known when the search has ended."""
-        left = self._to_describe[len(self._found) :]
+        left = [each.unit for each in self._to_describe[len(self._found) :]]
         if left:
             self._report.text("", f"Incomplete. Not described: unit ids {number_ranges(left)}.")
         self._report.end(
@@ -235,9 +236,9 @@ class _Run:
         return self._report.attempt(work, self._url, lambda: self._answering)
 
     def _ask(self, client: SyncClient, *, is_line: bool) -> None:
-        asked = self._asked
+        asked, delay = self._asked, self._plan.settings.delay
         with self._report.progress("Asking", len(asked), lambda: ""):
-            for unit in device_search.units(client, asked, delay=self._plan.settings.delay):
+            for unit in device_search.units(client, asked, delay=delay):
                 with self._report.held():
                     self._seen.append(unit)
                     self._report.advance(len(self._seen))
@@ -246,7 +247,9 @@ class _Run:
                         about = dict(unit.identity.objects)
                         self._report.entry({"unit": unit.unit, "identification": about})
         if len(asked) == len(self._seen):
-            self._ignores = device_search.ignores_unit(client, self._seen, is_line=is_line)
+            self._ignores = device_search.ignores_unit(
+                client, self._seen, is_line=is_line, delay=delay
+            )
 
     def _describe(self, unit: _UnitReport, client: SyncClient) -> None:
         survey = unit.found.survey

@@ -48,7 +48,7 @@ def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_
                         if unit.answers:
                             _print(unit, report, is_first=_count(found) == 1)
                         report.advance(len(found))
-                ignores = device_search.ignores_unit(client, found, is_line=is_line)
+                ignores = device_search.ignores_unit(client, found, is_line=is_line, delay=delay)
 
         with device.connect(url, asked[0], timeout) as client:
             why = report.attempt(search, url, lambda: _count(found))
