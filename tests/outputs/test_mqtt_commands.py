@@ -82,7 +82,11 @@ def test_names_of_states_and_switches_are_written(
     ("text", "detail"),
     [
         ("31", "31 is outside 5.0 to 30.0"),
-        ("21.55", "21.55 is between two values of the registers, allowed: steps of 0.1"),
+        (
+            "21.55",
+            "21.55 is between two values of the registers, allowed: steps of 0.1, or "
+            "`round: nearest` in the tag",
+        ),
         ("21,5", "'21,5' has a decimal comma, allowed: a decimal point, as in 21.5"),
         ("warm", "'warm' is not a number"),
         (b"\xff", "the payload is not UTF-8"),

@@ -120,7 +120,7 @@ def test_a_value_without_the_content_of_its_scale_is_refused() -> None:
         power.raw(4320)
     fixed = power.with_scale(1)
     assert (fixed.raw(4320), fixed.value(432), fixed.min) == (432, 4320, 0)
-    with pytest.raises(DoesNotFit, match=r"steps of 10$"):
+    with pytest.raises(DoesNotFit, match="steps of 10, or"):
         fixed.raw(4321)
     with pytest.raises(ValueError, match="is 10\\^-32768"):
         power.with_scale(-32768)

@@ -75,7 +75,12 @@ def test_what_is_read_can_be_written_and_gives_the_same_registers(
         ),
         (31, {"min": 5, "max": 30}, "31 is outside 5 to 30"),
         (4, {"min": 5}, "4 is outside 5 to"),
-        (1.5, {}, r"1.5 is between two values of the registers, allowed: steps of 1"),
+        (
+            1.5,
+            {},
+            "1.5 is between two values of the registers, allowed: steps of 1, or `round: nearest`",
+        ),
+        (49.99, {"scale": 100 / 27648}, "49.99 is between two values of the registers"),
         (math.nan, {"type": "float32"}, "nan is not a finite number"),
         (math.inf, {"scale": 2}, "inf is not a finite number"),
         (True, {}, "True is not a number"),

@@ -111,6 +111,23 @@ def test_the_text_of_an_integer_is_read_back_as_the_same_registers(raw: int, sca
 
 
 @pytest.mark.parametrize(
+    ("scale", "offset", "raws"),
+    [
+        (100 / 27648, 0, range(27649)),
+        (10 / 4095, -5, range(4096)),
+        (-1 / 3, 273.15, range(-0x8000, 0x8000, 7)),
+    ],
+    ids=["percent of 27648", "volts of 4095", "a third"],
+)
+def test_every_value_of_a_scale_with_many_digits_can_be_written(
+    scale: float, offset: float, raws: range
+) -> None:
+    it = tag("int16", scale=scale, offset=offset)
+    texts = (text_of(it, it.value(raw)) for raw in raws)
+    assert [it.raw(value_from(it, text)) for text in texts] == [*raws]
+
+
+@pytest.mark.parametrize(
     ("it", "text", "value"),
     [
         (tag(scale=0.1), " 21.5 ", 21.5),

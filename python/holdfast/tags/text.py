@@ -1,6 +1,7 @@
 """Values of tags as text and for JSON, and text as values to write.
 
-What `text_of` returns, `value_from` accepts, except for infinity.
+What `text_of` returns, `value_from` accepts, except for infinity and for scaled 64-bit integers with
+more digits than a float has.
 """
 
 from __future__ import annotations

@@ -91,11 +91,15 @@ class WritableTag(ScaledTag):
         exact = self._linear.number(value)
         if exact.denominator == 1:
             return exact.numerator
-        steps = f"steps of {abs(self.scale)}"
-        if not self.is_stepped or (self.round or default_round) == "exact":
-            raise DoesNotFit(f"{value} is between two values of the registers, allowed: {steps}")
         nearest = self._linear.nearest(value)
         rounded = self._linear.value(nearest)
+        if rounded == value:
+            return nearest  # A read returns this value: a float has not all digits of the scale.
+        steps = f"steps of {abs(self.scale)}"
+        if not self.is_stepped or (self.round or default_round) == "exact":
+            other = ", or `round: nearest` in the tag" if self.is_stepped and not self.round else ""
+            found = f"{value} is between two values of the registers"
+            raise DoesNotFit(f"{found}, allowed: {steps}{other}")
         self._check_limits(rounded, f"{value} is {rounded} in {steps},")
         return nearest
 
