@@ -353,6 +353,19 @@ def test_a_signal_leaves_the_terminal_as_it_was(
     assert terminal.shown.endswith("\x1b[?25h\x1b[?1049l")
 
 
+@pytest.mark.parametrize("kind", ["dumb", "unknown"])
+@pytest.mark.parametrize("words", [("hr", "0"), ("hr:0", "hr:1")])
+def test_a_terminal_that_redraws_nothing_gets_lines(
+    server: holdfast.Server, memory: holdfast.Memory, words: tuple[str, ...], kind: str
+) -> None:
+    with Terminal("watch", cli.url(server), *words, "--every", "0.05", TERM=kind) as terminal:
+        terminal.until("watching tcp://")
+        memory.write("holding_registers", 0, [4711])
+        terminal.until(" 0 -> 4711")
+        assert terminal.end(signal.SIGINT) == 0
+    assert "\x1b" not in terminal.shown
+
+
 def test_colours_are_left_out_if_they_are_not_wanted(
     server: holdfast.Server, memory: holdfast.Memory
 ) -> None:

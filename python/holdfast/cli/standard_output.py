@@ -34,6 +34,15 @@ def prepare() -> None:
             stream.reconfigure(encoding=encoding, errors="backslashreplace")
 
 
+def is_screen() -> bool:
+    """Whether text can be redrawn: not on a dumb terminal, as in an editor, nor without one."""
+    if not sys.stdout.isatty():
+        return False
+    from rich.console import Console  # It takes long to import.
+
+    return Console().is_interactive
+
+
 def is_unwritable(error: OSError) -> bool:
     """Whether this error is that of standard output, not of a file."""
     if error.filename is not None:

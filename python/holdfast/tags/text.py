@@ -1,6 +1,6 @@
 """Values of tags as text and for JSON, and text as values to write.
 
-What `text_of` returns, `value_from` accepts, except for infinity and for scaled 64-bit integers with
+What `text_of` returns, `value_from` accepts, except for infinity, and scaled 64-bit integers with
 more digits than a float has.
 """
 

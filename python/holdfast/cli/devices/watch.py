@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli import device_errors, terminal_text
+from holdfast.cli import device_errors, standard_output, terminal_text
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.live import schedule, sources
 from holdfast.cli.live.changes import Tracker
@@ -78,8 +77,8 @@ def watch(
     modbus-tcp.
 
     On a terminal, shows all values, with changes highlighted, and rates of change. q quits, n and p
-    turn pages. Without a terminal, or with --json, prints a line for every change; with --csv, a
-    line for every reading.
+    turn pages. Without a terminal, on a dumb one (TERM=dumb), or with --json, prints a line for
+    every change; with --csv, a line for every reading.
 
     Exit codes: 0 ended by q or Ctrl-C, 1 the first reading failed, 2 wrong usage.
     """
@@ -121,7 +120,7 @@ def watch(
         except (ModbusError, Unreadable, OSError) as error:
             answer = {"target": source.url} if as_json else None
             device_errors.fail(error, source.url, answer, where=source.where)
-        if sys.stdout.isatty() and not as_json:
+        if not as_json and standard_output.is_screen():
             from holdfast.cli.live.registers_view import View
 
             view = View(source, first, every, note)

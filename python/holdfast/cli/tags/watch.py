@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast.cli import terminal_text
+from holdfast.cli import standard_output, terminal_text
 from holdfast.cli.device_errors import fail, hint
 from holdfast.cli.live import schedule
 from holdfast.cli.live.sources import print_error
@@ -35,7 +34,7 @@ def watch_tags(source: TagSource, form: Form, every: float, times: int | None) -
         if error is not None:
             answer = {"target": source.url} if form == "json" else None
             fail(error, source.url, answer, where=source.where)
-        if form == "text" and sys.stdout.isatty():
+        if form == "text" and standard_output.is_screen():
             from holdfast.cli.tags.view import TagView
 
             view = TagView(source, first, every)
