@@ -534,13 +534,14 @@ def test_ticks_do_not_drift_and_leave_out_what_was_missed(
     assert seen == [(0, 100), (1, 102), (2, 104), (3, 110), (4, 112)]
 
 
-def test_a_signal_ends_repeated_readings(server: holdfast.Server) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_repeated_readings(server: holdfast.Server, number: signal.Signals) -> None:
     process = Command("read", cli.url(server), "hr", "0", "--every", "0.01")
     try:
         assert process.stdout is not None
         assert process.stdout.readline().split() == ["time", "0"]
         assert process.stdout.readline()
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         _, log = process.communicate(timeout=wire.DEADLINE)
     finally:
         process.kill()

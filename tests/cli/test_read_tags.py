@@ -280,12 +280,15 @@ def test_a_recording_that_can_not_be_continued_ends_the_command(
     assert record.read_text().endswith("\n")
 
 
-def test_ctrl_c_leaves_a_whole_recording(server: holdfast.Server, tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_leaves_a_whole_recording(
+    server: holdfast.Server, tmp_path: Path, number: signal.Signals
+) -> None:
     record = tmp_path / "values.csv"
     arguments = ["read", cli.url(server), "hr:0", "--every", "0.001", "--record", str(record)]
     process = Command(*arguments)
     wire.until(lambda: record.exists() and record.read_text().count("\n") > 20, "rows are written")
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, log = process.communicate(timeout=wire.DEADLINE)
     assert (process.returncode, log) == (0, "")
     text = record.read_text()

@@ -62,8 +62,8 @@ class Watch:
         assert self.process.stdout is not None
         return self.process.stdout.readline()
 
-    def end(self) -> int:
-        self.process.send_signal(signal.SIGINT)
+    def end(self, number: signal.Signals = signal.SIGINT) -> int:
+        self.process.send_signal(number)
         _, log = self.process.communicate(timeout=wire.DEADLINE)
         assert log == ""
         return self.process.wait()
@@ -110,7 +110,7 @@ def test_changes_of_a_device_are_lines(
     assert re.fullmatch(r"\d\d:\d\d:\d\d\.\d\d\d", time)
     assert words == ["holding_registers", "5:", "0", "->", "2", "+2"]
     assert watching.line().split()[1:] == ["holding_registers", "6:", "0", "->", "3", "+3"]
-    assert watching.end() == 0
+    assert watching.end(signal.SIGTERM) == 0
 
 
 def test_changes_are_objects_for_programs(

@@ -60,8 +60,8 @@ class Watching:
         assert self.process.stdout is not None
         return self.process.stdout.readline().rstrip()
 
-    def end(self) -> int:
-        self.process.send_signal(signal.SIGINT)
+    def end(self, number: signal.Signals = signal.SIGINT) -> int:
+        self.process.send_signal(number)
         self.process.communicate(timeout=wire.DEADLINE)
         return self.process.wait()
 
@@ -81,7 +81,7 @@ def test_every_change_of_a_tag_is_a_line(
         assert watching.line().endswith(f"  {name}: 21.5 -> 21.6 °C")
         memory.write("holding_registers", 1, [0])
         assert watching.line().endswith("  state: running (1) -> off (0)")
-        assert watching.end() == 0
+        assert watching.end(signal.SIGTERM) == 0
 
 
 def test_changes_are_json_for_programs(server: holdfast.Server, memory: holdfast.Memory) -> None:

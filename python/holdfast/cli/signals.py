@@ -127,6 +127,16 @@ def interruptions() -> Iterator[Signals]:
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
+@contextmanager
+def sigterm_as_ctrl_c() -> Iterator[None]:
+    """Lets SIGTERM raise `KeyboardInterrupt`, as Ctrl-C does, in a command that runs until it."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
 def _has_terminal() -> bool:
     """Whether standard input is a terminal that was not closed."""
     try:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 import re
-import signal
 import time
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
@@ -19,7 +18,6 @@ from holdfast.cli.live import keys, schedule
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from types import FrameType
 
     from holdfast.cli.live.keys import Wait
 
@@ -79,16 +77,12 @@ class Screen(ABC):
 
     def run(self, times: int | None) -> None:
         """Shows readings until q or Ctrl-C. The first one has been read before."""
-        before = signal.signal(signal.SIGTERM, _quit)
-        try:
-            with contextlib.suppress(Quit, KeyboardInterrupt), keys.keys() as wait, self._live:
-                self._wait = wait
-                for tick in schedule.ticks(self._every, times, self._pause):
-                    if tick:
-                        self.read()
-                    self._draw()
-        finally:
-            signal.signal(signal.SIGTERM, before)
+        with contextlib.suppress(Quit, KeyboardInterrupt), keys.keys() as wait, self._live:
+            self._wait = wait
+            for tick in schedule.ticks(self._every, times, self._pause):
+                if tick:
+                    self.read()
+                self._draw()
 
     def between(self) -> None:
         """Handles keys during a reading, and redraws after a while."""
@@ -136,8 +130,3 @@ class Screen(ABC):
             head.append(f"   {terminal_text.counted(errors, 'error')}", "red")
         second = Text(terminal_text.plain(error), "bold red") if error else Text()
         return [head, second]
-
-
-def _quit(_number: int, _frame: FrameType | None) -> None:
-    """Ends the view by an exception, so that the terminal is restored."""
-    raise Quit
