@@ -15,8 +15,13 @@ import pytest
 
 import holdfast
 from holdfast import values
+from holdfast.cli.devices.describe_output import described_lines
 from holdfast.config.tag_files.read import load_tags
 from holdfast.discovery import device_search, segments
+from holdfast.discovery.address_search import Survey
+from holdfast.discovery.described_tag import DescribedTag
+from holdfast.discovery.description import Description
+from holdfast.tags import Tag
 from support import cli, sunspec_device, wire
 from support.cli import answer, done, usage_error
 from support.commands import Command
@@ -239,6 +244,24 @@ def test_a_signal_ends_the_inference(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_wrong_usage_is_told(options: tuple[str, ...], told: str) -> None:
     assert told in usage_error("describe", "tcp://127.0.0.1:1", *options)
+
+
+@pytest.mark.parametrize(
+    ("kind", "order", "shown"),
+    [
+        ("uint16", "ABCD", []),
+        ("uint16", "CDAB", []),
+        ("uint16", "DCBA", ["DCBA"]),
+        ("int16", "BADC", ["BADC"]),
+        ("uint32", "ABCD", ["ABCD"]),
+    ],
+)
+def test_an_order_is_shown_where_it_has_an_effect(kind: str, order: str, shown: list[str]) -> None:
+    found = Description(1, Survey(["holding_registers"]))
+    tag = Tag("it", "holding_registers", 7, kind, order)
+    found.tags = [DescribedTag(tag, 0.9, (5,), ())]
+    [row] = [line.split() for line in described_lines(found, None) if line.startswith("it")]
+    assert row[3:] == [kind, *shown, "5", "0.90"]
 
 
 def test_a_file_is_not_replaced_without_force(plant: str, tmp_path: Path) -> None:

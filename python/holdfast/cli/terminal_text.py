@@ -16,6 +16,7 @@ from holdfast.cli import answers
 from holdfast.runtime.text import counted as counted
 from holdfast.runtime.text import extent
 from holdfast.values.digits import decimal_of
+from holdfast.values.orders import SWAPPED_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.devices import RangeConfig
     from holdfast.config.models.listeners import ExceptionStatusConfig
     from holdfast.importing import Note
+    from holdfast.tags import Tag
 
 
 def styled(text: str, **style: Any) -> str:
@@ -77,6 +79,11 @@ def plain(text: str) -> str:
 def _escaped(letter: str) -> str:
     code = ord(letter)
     return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
+
+
+def order_shown(tag: Tag) -> str:
+    """The byte order of a tag; empty if the order has no effect on its single register."""
+    return tag.order if tag.count > 1 or tag.order in SWAPPED_BYTES else ""
 
 
 def shown(value: Any, kind: str) -> str:

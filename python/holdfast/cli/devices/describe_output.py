@@ -144,7 +144,7 @@ def _row(each: DescribedTag) -> tuple[str, ...]:
         tag.area,
         str(tag.address) if tag.count == 1 else f"{tag.address}-{tag.end - 1}",
         tag.type,
-        tag.order if tag.count > 1 else "",
+        terminal_text.order_shown(tag),
         _value(each),
         tag.unit,
         f"{each.confidence:.2f}",

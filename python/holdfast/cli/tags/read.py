@@ -15,6 +15,7 @@ from holdfast.cli.tags import recording
 from holdfast.cli.terminal_text import print_json
 from holdfast.errors import ModbusError, RequestTimeout
 from holdfast.tags.text import plain, text_of
+from holdfast.values.orders import DEFAULT_ORDER
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -131,9 +132,9 @@ def _error(reading: Reading) -> str:
 
 def place(tag: Tag) -> str:
     """Place and type of a tag: `holding_registers 100 float32 CDAB`."""
-    plain_orders = ("ABCD", "CDAB") if tag.count == 1 else ("ABCD",)
-    order = "" if tag.order in plain_orders else f" {tag.order}"
-    return f"{tag.area} {tag.address} {tag.type}{order}"
+    order = terminal_text.order_shown(tag)
+    shown = "" if order in ("", DEFAULT_ORDER) else f" {order}"
+    return f"{tag.area} {tag.address} {tag.type}{shown}"
 
 
 def _explain(readings: Sequence[Reading]) -> None:
