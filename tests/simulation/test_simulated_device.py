@@ -232,7 +232,12 @@ U = "t holds 0 to 6553.5 V (uint16, scale 0.1), found"
         ("float32", {}, "constant:1e39", "t holds -3.4028235e+38 to 3.4028235e+38 (float32), "),
         ("uint16", {"null": frozenset([65535])}, "constant:70000", "t holds 0 to 65534 (uint16)"),
         ("uint16", {"null": frozenset([7])}, "constant:7", "t: found 7, which stands for no value"),
-        ("uint16", {"states": {70000: "on"}}, "constant:on", "t holds 0 to 65535 (uint16), found"),
+        (
+            "uint16",
+            {"states": {7: "on"}, "null": frozenset([7])},
+            "constant:on",
+            "t: found 7, which stands for no value",
+        ),
         ("int16[2]", {}, "constant:[1, 40000]", "t holds -32768 to 32767 (int16[2]), found 40000"),
         ("int16[2]", {}, "constant:[1]", "t: int16[2] takes 2 values, found 1"),
         ("bool[2]", {}, "constant:[true, 5]", "t: 5 is not False, True, 0 or 1, which bool"),
@@ -279,8 +284,8 @@ def test_usual_values_fit_into_every_type() -> None:
         Tag("t", "input_registers", 0, "bcd16", unit="kWh", offset=-3),
         Tag("t", "input_registers", 0, "uint16", scale=1e-4, unit="V"),
         Tag("t", "input_registers", 0, "uint16", min=-5, max=70000),
-        Tag("t", "input_registers", 0, "uint16", states={70000: "never", 2: "on"}),
-        Tag("t", "input_registers", 0, "uint16", states={70000: "never"}),
+        Tag("t", "input_registers", 0, "uint16", states={7: "never", 2: "on"}, null=frozenset([7])),
+        Tag("t", "input_registers", 0, "uint16", states={7: "never"}, null=frozenset([7])),
     ]:
         SimulatedDevice(TagList([tag]))
 

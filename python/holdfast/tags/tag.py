@@ -23,6 +23,7 @@ from holdfast.values import (
 )
 from holdfast.values.digits import decimal_of
 from holdfast.values.integers import as_integer
+from holdfast.values.numeric import limits
 from holdfast.values.orders import DEFAULT_ORDER
 from holdfast.values.types import Type, parsed
 
@@ -121,6 +122,8 @@ class Tag(WritableTag):
             raise TagError("max", f"max is {self.max}, allowed: at least min, {self.min}")
         if self.states and (self.is_float or self.of_type.base in ("string", "bytes")):
             raise TagError("states", f"found states of {self.type}, allowed: integers and bits")
+        for state in self.states:
+            self._check_state(state)
         if len(set(self.states.values())) < len(self.states):
             names = list(self.states.values())
             twice = next(name for name in names if names.count(name) > 1)
@@ -128,6 +131,19 @@ class Tag(WritableTag):
         if self.round is not None and not self.is_stepped:
             message = "allowed: only with integers without states"
             raise TagError("round", f"round is {self.round}, {message}")
+
+    def _check_state(self, state: int) -> None:
+        """Raises `TagError` for a number that the registers never hold."""
+        if isinstance(self.scale, RegisterScale):
+            return
+        number = self._linear.number(state)
+        if number.denominator != 1:
+            found = f"{state} is between two values of the registers"
+            raise TagError("states", f"{found}, allowed: steps of {abs(self.scale)}")
+        least, most = limits(self.of_type.base) if self.is_number else (0, 1)
+        if not least <= number <= most:
+            found = f"{state}" if number == state else f"{state}, {number} in the registers,"
+            raise TagError("states", f"{found} is outside {least} to {most} of {self.type}")
 
     def _check_writable(self) -> None:
         if self.writable and (flaw := self.unwritable) is not None:

@@ -96,6 +96,8 @@ class TagConfig(Model):
         order = (self.order or order).upper()
         if INVALID in (*self.null, *self.states.values()):
             raise InvalidValue
+        if not all(isinstance(number, int) for number in self.states):
+            raise InvalidValue  # Invalid keys stay in a mapping.
         if isinstance(self.scale, ScaleConfig):
             settings["scale"] = self.scale.of(order)
         return Tag(name, null=frozenset(self.null), order=order, **settings)
