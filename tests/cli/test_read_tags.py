@@ -13,6 +13,10 @@ from pathlib import Path
 import pytest
 
 import holdfast
+from holdfast import values
+from holdfast.cli.tags import recording
+from holdfast.config.tag_files.read import load_tags
+from holdfast.simulation import playback
 from support import cli, wire
 from support.cli import answer, done, failure, invoke, usage_error
 from support.commands import Command
@@ -243,6 +247,39 @@ def test_an_incomplete_line_of_a_recording_is_removed(
     head, first, second = record.read_text().splitlines()
     assert (head, first) == ("time,hr:0", "2026-01-01T00:00:00.000Z,230")
     assert second.endswith("Z,0")
+
+
+TEXTS = "tags: {t: {area: holding_registers, address: 0, type: 'string:12', encoding: latin-1}}"
+
+
+@pytest.mark.parametrize("text", ["A\nB", "A\rB", 'a"\n"b', " \\x0a,\x1b; "], ids=ascii)
+def test_a_recorded_text_is_played_back(
+    server: holdfast.Server, memory: holdfast.Memory, tmp_path: Path, text: str
+) -> None:
+    memory.write("holding_registers", 0, values.encode(text, "string:12", encoding="latin-1"))
+    file, record = tmp_path / "texts.yaml", tmp_path / "values.csv"
+    file.write_text(TEXTS)
+    arguments = ("read", cli.url(server), "--tags", str(file), "--record", str(record))
+    for _ in range(2):  # The second one finds the end of the first one's line.
+        result = invoke(*arguments)
+        assert (result.exit_code, result.stderr) == (0, "")
+    assert invoke(*arguments[:4], "--csv").stdout.count(text.replace('"', '""')) == 1
+    assert playback.load(record, load_tags(file)) == {"t": [text, text]}
+
+
+@pytest.mark.parametrize("torn", ['2026,"A\n', '2026,"A""\nB', '2026,"A\nB"', "2026,A"], ids=ascii)
+@pytest.mark.parametrize("block", [1, 7, recording.BLOCK])
+def test_a_line_break_in_a_text_is_no_end_of_a_line(
+    server: holdfast.Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, torn: str, block: int
+) -> None:
+    monkeypatch.setattr(recording, "BLOCK", block)
+    record = tmp_path / "values.csv"
+    whole = 'time,hr:0\n2026,"A\n""B""\n"\n'
+    record.write_text(whole + torn)
+    result = invoke("read", cli.url(server), "hr:0", "--record", str(record))
+    assert (result.exit_code, result.stderr) == (0, f"{record}: removed an incomplete last line\n")
+    assert record.read_text().startswith(whole + "2")
+    assert record.read_text().endswith("Z,0\n")
 
 
 def test_a_recording_without_a_whole_first_line_begins_again(

@@ -39,7 +39,7 @@ def read_tags(source: TagSource, form: Form, every: float | None, times: int | N
             if any(each.error is not None for each in readings):
                 code = ExitCode.FAILED
             if form == "csv":
-                click.echo(recording.row(moment, readings), nl=False)
+                click.echo(recording.row(moment, readings, is_shown=sys.stdout.isatty()), nl=False)
                 if every is None:
                     _explain(readings)
             elif form == "json":

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 FILE_MODE = 0o644
 
+BLOCK = 1 << 20
+"""How much of a file is read at a time."""
+
 
 class NotARecording(ValueError):
     """A file that has something else."""
@@ -32,19 +35,22 @@ def head(tags: Iterable[Tag]) -> str:
     return _line(["time", *(tag.name for tag in tags)])
 
 
-def row(moment: float, readings: Sequence[Reading]) -> str:
+def row(moment: float, readings: Sequence[Reading], *, is_shown: bool = False) -> str:
     """The line of one reading; the cell of a tag that was not read is empty.
 
-    States are numbers, so that the line can be plotted and played back.
+    States are numbers, so that the line can be plotted and played back. Control characters in texts
+    are escaped if the line `is_shown` on a terminal.
     """
-    cells = [terminal_text.plain(text_of(each.tag, each.value, states=False)) for each in readings]
+    cells = [text_of(each.tag, each.value, states=False) for each in readings]
+    if is_shown:
+        cells = [terminal_text.plain(cell) for cell in cells]
     return _line([log_lines.timestamp(moment), *cells])
 
 
 def _line(cells: Sequence[str]) -> str:
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerow(cells)
-    return text.getvalue()
+    csv.writer(text).writerow(cells)  # Its own end of line, so that it quotes "\r" and "\n".
+    return text.getvalue().removesuffix("\r\n") + "\n"
 
 
 class Recording:
@@ -78,23 +84,27 @@ class Recording:
                 f"found {terminal_text.plain(first)!r} in the first line, allowed: {allowed!r}, "
                 "an empty file or a new one"
             )
-        whole = self._whole(about.st_size)
+        whole = self._whole()
         if whole < about.st_size:
             self.removed = about.st_size - whole
             os.ftruncate(self._file, whole)
         if not whole:
             self._append(head)
 
-    def _whole(self, size: int) -> int:
-        """The bytes up to the end of the last whole line."""
-        end = size
-        while end:
-            start = max(0, end - 65536)
-            place = self._at(start, end - start).rfind(b"\n")
-            if place >= 0:
-                return start + place + 1
-            end = start
-        return 0
+    def _whole(self) -> int:
+        """The bytes up to the end of the last whole line: a newline in quotes is part of a text."""
+        whole = at = 0
+        is_quoted = False
+        while block := self._at(at, BLOCK):
+            for part in block.split(b'"'):
+                end = part.rfind(b"\n") + 1
+                if end and not is_quoted:
+                    whole = at + end
+                is_quoted = not is_quoted
+                at += len(part) + 1
+            is_quoted = not is_quoted  # No quote is behind the last part.
+            at -= 1
+        return whole
 
     def _at(self, start: int, count: int) -> bytes:
         os.lseek(self._file, start, os.SEEK_SET)

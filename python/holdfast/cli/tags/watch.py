@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -66,7 +67,7 @@ def _lines(
         before = tracker.error
         changes = tracker.update(time.monotonic(), readings)
         if form == "csv":
-            click.echo(recording.row(moment, readings), nl=False)
+            click.echo(recording.row(moment, readings, is_shown=sys.stdout.isatty()), nl=False)
         elif tracker.error is not None:
             if before is None:
                 print_error(tracker.error, source.url, as_json=form == "json")
