@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from holdfast import values
 from support import cli, wire
 from support.brokers import free_port
 from support.cli import answer, done, failure, usage_error
@@ -164,11 +165,27 @@ def test_many_values_are_written_by_several_requests_if_that_is_wanted(
         (("30001", "1", "--modicon"), "input_registers can't be written, only read."),
         (("hr", "0", "1", "--tpye", "int16"), "No such option '--tpye'."),
         (("hr", "0", "1", "-v"), "No such option '-v'."),
+        (("hr", "0", "1", "-v", "--", "-w"), "No such option '-v'."),
+        (("hr", "0", "-5h", "--type", "int16"), "'-5h' is not an integer"),
         (("hr", "65535", "1", "2"), "65535"),
     ],
 )
 def test_wrong_usage_is_told(words: tuple[str, ...], told: str) -> None:
     assert told in usage_error("write", NOWHERE, *words)
+
+
+@pytest.mark.parametrize("text", ["-ab", "-h", "--", "-5h"])
+def test_words_behind_two_hyphens_are_values(
+    server: holdfast.Server, memory: holdfast.Memory, text: str
+) -> None:
+    done("write", cli.url(server), "hr", "0", "--type", "string:4", "--", text)
+    written = values.encode(text, "string:4")
+    assert memory.read("holding_registers", 0, 2) == written
+
+
+@pytest.mark.parametrize("word", ["-h", "--help"])
+def test_the_help_is_a_word_of_its_own(word: str) -> None:
+    assert done("write", NOWHERE, "hr", "0", word)[0].startswith("Usage: ")
 
 
 def test_a_refusal_is_told(server: holdfast.Server) -> None:

@@ -44,10 +44,26 @@ NUMBER = re.compile(
 NEGATIVE = re.compile(r"-(\.?[0-9]|inf|nan)", re.I)
 
 
+AS_THEY_ARE = f"{__name__}.as_they_are"
+"""The place in the context of how many words are behind `--`."""
+
+
+class _Write(click.Command):
+    """A command whose words may look like options."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parses the arguments. -h is an option as a word of its own only: -5h contains none."""
+        end = args.index("--") if "--" in args else len(args)
+        ctx.meta[AS_THEY_ARE] = len(args[end + 1 :])
+        options = ["--help" if each == "-h" else each for each in args[:end]]
+        return super().parse_args(ctx, [*options, *args[end:]])
+
+
 @click.command(
+    cls=_Write,
     epilog="Example: holdfast write tcp://192.168.0.10 hr 100 21.5 --type float32 --order CDAB",
-    # Otherwise -5 would be an unknown option.
-    context_settings={"ignore_unknown_options": True},
+    # Otherwise -5 would be an unknown option, and -5h would print the help.
+    context_settings={"ignore_unknown_options": True, "help_option_names": ["--help"]},
 )
 @tag_options.url_argument
 @words_argument("[ITEM VALUE... | NAME=VALUE...]")
@@ -82,7 +98,7 @@ def write(
 
     Coils take true, false, on, off, 1, 0; registers take 0 to 65535, decimal or 0x. With --type,
     VALUEs are of that type: text for a string, hex for bytes. bit:N writes one bit of a register
-    with function 22, which keeps the other bits.
+    with function 22, which keeps the other bits. Behind --, words that begin with - are VALUEs too.
 
     With --tags, writes NAME=VALUE: values are scaled, states have names, and only tags that are
     writable are written. If a value does not fit, nothing is sent.
@@ -117,7 +133,8 @@ def write(
         raise click.UsageError(f"{words[0]!r}: NAME=VALUE requires --tags or --config.")
     first, left = item.take(words, modicon=modicon)
     place = first.place
-    for word in left:
+    as_they_are = click.get_current_context().meta[AS_THEY_ARE]
+    for word in left[: max(0, len(left) - as_they_are)]:
         if word.startswith("--") or (word.startswith("-") and not NEGATIVE.match(word)):
             raise click.NoSuchOption(word)
     if place.area not in WRITE_LIMITS:
