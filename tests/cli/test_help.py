@@ -41,6 +41,11 @@ def test_the_help_imports_no_command() -> None:
         (("raed",), "No such command 'raed'. Did you mean 'read'"),
         (("Describe",), "Did you mean 'describe'?"),
         (("mpa",), "Did you mean 'describe map'?"),
+        (
+            ("describe", "mapp", "tcp://plc"),
+            "No such command 'describe mapp'. Did you mean 'describe map'?",
+        ),
+        (("describe", "plc"), "'plc' is not the URL of a device"),
         (("replicsa",), "Did you mean 'log status' or 'log replay'?"),
         (("import", "mmaa"), "No such command 'mmaa'. Did you mean 'mma'?"),
         (("xyzzy",), "No such command 'xyzzy'."),

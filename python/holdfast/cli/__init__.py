@@ -237,6 +237,15 @@ class Program(SuggestingGroup):
         if isinstance(command, CommandWithSubcommands) and left and left[0] in command.subcommands:
             name = f"{name} {left[0]}"
             return name, command.subcommand(left[0]), renewed(name, left[1:], silent=silent)
+        if (
+            isinstance(command, CommandWithSubcommands)
+            and left
+            and left[0].isalpha()
+            and not silent
+        ):
+            typed = {each: f"{name} {each}" for each in command.subcommands}
+            if meant := _suggestion(left[0], typed):
+                ctx.fail(f"No such command '{name} {left[0]}'.{meant}")
         if isinstance(command, click.Group):
             return (
                 name,
