@@ -182,13 +182,21 @@ def test_a_command_prints_its_keys(
         assert printed
         for found in printed:
             assert found["ok"] is is_good
-            assert set(found) <= shared | own.get(name, set())
+            for each in (found, *found.get("found", ())):
+                assert set(each) <= shared | own.get(name, set())
             assert ("target" in found) == (name not in NO_TARGET)
             if is_good:
                 assert "reason" not in found
             else:
                 assert found["reason"] in reasons
                 assert isinstance(found["detail"], str)
+
+
+def test_a_row_of_a_network_has_the_keys_of_find(server: holdfast.Server) -> None:
+    shared, own, _ = tables()
+    port = cli.url(server).rpartition(":")[2]
+    [row] = cli.answer("find", "127.0.0.1/32", "--port", port)["found"]
+    assert {"host", "url", "modbus"} <= set(row) <= shared | own["find"]
 
 
 def test_every_command_with_json_is_tried_and_listed() -> None:
