@@ -6,6 +6,7 @@ import contextlib
 import socket
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -14,10 +15,12 @@ import pytest
 from holdfast.config.models.outputs import MqttOutputConfig
 from holdfast.net.mqtt.packets import parse_publish
 from holdfast.net.mqtt.stream import Packets
+from holdfast.outputs import sending
 from holdfast.outputs.mqtt import MqttOutput, session
 from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES
 from holdfast.runtime.stop import Stop
-from support.mqtt_peer import CONNECT, DISCONNECT, FakeBroker, Peer
+from support import wire
+from support.mqtt_peer import CONNECT, DISCONNECT, PUBLISH, FakeBroker, Peer
 from support.readings import TIME, numbered, reading, tag
 
 if TYPE_CHECKING:
@@ -235,9 +238,28 @@ def test_a_broker_that_confirms_nothing_publishes_the_will(
         if ends:
             sent.result()
         else:
-            with pytest.raises(TimeoutError, match="confirmed no message"):
+            with pytest.raises(TimeoutError, match="did not confirm"):
                 sent.result()
     assert DISCONNECT not in kinds
+
+
+def test_a_broker_that_confirms_slowly_holds_no_stop(
+    stop: Stop, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is left must be stored in time: confirmations do not extend the wait."""
+    monkeypatch.setattr(session, "STOP_TIMEOUT_S", inf)
+    monkeypatch.setattr(sending, "STOP_TIMEOUT_S", 0.0)
+    with FakeBroker() as broker, ThreadPoolExecutor(1) as threads:
+        output = made(broker, Site(), stop)
+        sent = threads.submit(output.send, numbered(2))
+        with broker.accept() as peer:
+            peer.expect(CONNECT)
+            peer.connack()
+            while peer.receive().kind != PUBLISH:
+                pass
+            stop.set()
+            with pytest.raises(TimeoutError, match="did not confirm all"):
+                sent.result(wire.DEADLINE)
 
 
 def test_a_password_that_is_too_long_is_an_error_of_its_file(stop: Stop, tmp_path: Path) -> None:

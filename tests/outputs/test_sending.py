@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from math import inf
 from typing import TYPE_CHECKING
 
 import pytest
@@ -46,8 +47,10 @@ class Fake(Receiver):
 class Running:
     """An output that runs in a thread."""
 
-    def __init__(self, file: Path | None = None) -> None:
+    def __init__(self, file: Path | None = None, buffer: Buffer | None = None) -> None:
         self.receiver, self.buffer, self.stop = Fake(), Buffer(), Stop()
+        if buffer is not None:
+            self.buffer = buffer
         self.open_file: Callable[[], Stored] | None = None
         if file is not None:
             self.open_file = lambda: Stored(file, 2**30, lambda *_: tag())
@@ -209,7 +212,7 @@ def test_what_is_refused_at_the_end_is_not_kept(tmp_path: Path) -> None:
     output.buffer.offer(polls(3))
     output.buffer.stored = Stored(tmp_path / "b.db", 2**30, lambda *_: tag())
     output.receiver.error = Refused("HTTP 400")
-    output.sending._finish()
+    output.sending._finish(inf)
     assert (refused(output), len(output.buffer)) == (3, 0)
     output.buffer.detach()
 
@@ -327,6 +330,30 @@ def test_a_buffer_keeps_what_waits_for_the_next_output() -> None:
     output.start()
     wire.until(lambda: output.receiver.sent == [0, 1, 2, 3, 4], "all is sent")
     output.end()
+
+
+def test_two_outputs_never_share_a_buffer() -> None:
+    """As after a reload, while the receiver before holds up the end of its output."""
+    before, goes_on = Running(), threading.Event()
+
+    def slow(_: list[Reading]) -> None:
+        before.receiver.attempts += 1
+        goes_on.wait(wire.DEADLINE)
+        raise OSError("down")
+
+    before.receiver.send = slow  # type: ignore[method-assign]
+    before.buffer.offer(polls(3))
+    try:
+        wire.until(lambda: before.receiver.attempts, "it is tried")
+        before.stop.set()
+        second, third = Running(buffer=before.buffer), Running(buffer=before.buffer)
+        second.end()
+        assert second.receiver.attempts == 0
+    finally:
+        goes_on.set()
+    wire.until(lambda: third.receiver.sent == [0, 1, 2], "all is sent")
+    before.end()
+    third.end()
 
 
 def test_a_file_that_can_not_be_opened_stops_nothing(

@@ -34,6 +34,8 @@ class Buffer:
 
     def __init__(self, most: int = MAX_VALUES) -> None:
         self.most = most
+        self.in_use = threading.Lock()
+        """Held by the output that sends: after a reload, the one before may still be ending."""
         self._waiting: deque[Sequence[Reading]] = deque()
         """Polls."""
         self._count = 0

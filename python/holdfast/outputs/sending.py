@@ -100,7 +100,6 @@ class Sending:
         self._open_file = open_file
         self._sent = self._refused = 0
         self._logged_dropped, self._logged_at = buffer.dropped, -inf
-        self._stopped_at = inf
         self._looked_at = -inf
         self._backoff = Backoff(FIRST_PAUSE_S, MAX_PAUSE_S, jitter=True)
         self._pause = 0.0
@@ -109,8 +108,20 @@ class Sending:
         self._file_error: str | None = None
 
     def run(self, stop: Stop) -> None:
-        """Sends until `stop` is set. Then sends or stores the rest."""
-        stop.then(self._stopping)
+        """Sends until `stop` is set. Then sends or stores the rest.
+
+        First waits for the output before, which may still end: two would send the same readings.
+        """
+        while not self._buffer.in_use.acquire(timeout=CHECK_INTERVAL_S):
+            if stop.is_set():
+                return
+        try:
+            self._run(stop)
+        finally:
+            self._buffer.in_use.release()
+
+    def _run(self, stop: Stop) -> None:
+        stop.then(self._buffer.wake)
         self._receiver.until(stop)
         try:
             while not stop.is_set():
@@ -119,17 +130,13 @@ class Sending:
                     self._wait(stop)
                 self._keep_late()
                 self._log_dropped()
-            self._finish()
+            self._finish(stop.at + STOP_TIMEOUT_S)
         except Exception:
             self._keep(STORE_TIMEOUT_S)
             raise
         finally:
             self._receiver.close()
             self._buffer.detach()
-
-    def _stopping(self) -> None:
-        self._stopped_at = time.monotonic()
-        self._buffer.wake()
 
     def status(self) -> dict[str, object]:
         """The counters of readings, and the last errors."""
@@ -221,9 +228,8 @@ class Sending:
         if is_late:
             self._keep(CHECK_INTERVAL_S)
 
-    def _finish(self) -> None:
-        """Sends remaining readings for `STOP_TIMEOUT_S`, then moves the rest to the file."""
-        end = self._stopped_at + STOP_TIMEOUT_S
+    def _finish(self, end: float) -> None:
+        """Sends remaining readings until `end`, then moves the rest to the file."""
         if not self._is_failing:
             while len(self._buffer) and time.monotonic() < end:
                 try:

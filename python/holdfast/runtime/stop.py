@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+import time
+from math import inf
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -16,10 +18,13 @@ class Stop:
         self._event = threading.Event()
         self._lock = threading.Lock()
         self._then: list[Callable[[], object]] = []
+        self.at = inf
+        """When the stop was requested, by `time.monotonic`."""
 
     def set(self) -> None:
         """Requests the stop."""
         with self._lock:
+            self.at = min(self.at, time.monotonic())
             self._event.set()
             then, self._then = self._then, []
         for callback in then:

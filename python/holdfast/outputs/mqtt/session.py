@@ -15,6 +15,7 @@ from holdfast.events import log_lines
 from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S
 from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secure_channel import failure_text
+from holdfast.outputs import sending
 from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES, Connection
 from holdfast.outputs.mqtt.delivery import Delivery, Message
 from holdfast.runtime.standstill import MAX_LOOK_INTERVAL_S, Standstill
@@ -115,7 +116,8 @@ class Session:
     def wait(self, delivery: Delivery) -> None:
         """Waits until the broker has confirmed all messages. Raises `OSError`.
 
-        After a stop, it waits only a short time.
+        After a stop, it waits only a short time, even if the broker goes on to confirm messages:
+        what is left must be stored before the output is given up.
         """
         confirmed, since = delivery.confirmed, time.monotonic()
         with self._news:
@@ -126,8 +128,9 @@ class Session:
                 now = time.monotonic()
                 if delivery.confirmed != confirmed:
                     confirmed, since = delivery.confirmed, now
-                elif now - since > (STOP_TIMEOUT_S if self._stop.is_set() else CONFIRM_TIMEOUT_S):
-                    raise TimeoutError("the broker confirmed no message in time")
+                limit = STOP_TIMEOUT_S if self._stop.is_set() else CONFIRM_TIMEOUT_S
+                if now > min(since + limit, self._stop.at + sending.STOP_TIMEOUT_S):
+                    raise TimeoutError("the broker did not confirm all messages in time")
 
     def close(self, last: Sequence[Message] = (), *, with_will: bool = False) -> None:
         """Publishes the last messages, and ends the connection.
