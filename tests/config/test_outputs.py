@@ -182,6 +182,26 @@ def test_files_of_outputs_have_a_folder_and_are_regular(tmp_path: Path) -> None:
             assert found == f"p.yaml:2: outputs.o.{key}: found {file!r}, {reason}, {PLACE}"
 
 
+MQTT = "type: mqtt, url: 'mqtt://h'"
+
+
+@pytest.mark.parametrize(
+    ("outputs", "count"),
+    [
+        (f"{{o: {{{MQTT}}}, p: {{{MQTT}, payload: device}}}}", 1),
+        (f"{{o: {{{MQTT}}}, p: {{{MQTT}, status: plant/p}}}}", 0),
+        (f"{{o: {{{MQTT}}}, p: {{type: mqtt, url: 'mqtt://other'}}}}", 0),
+    ],
+)
+def test_outputs_at_one_broker_need_a_status_each(
+    tmp_path: Path, outputs: str, count: int
+) -> None:
+    found = "outputs.p.status: found 'plant/holdfast/status', which is the status topic of outputs.o"
+    found += " at the same broker, and can't show both, allowed: a different one"
+    expected = [f"p.yaml:2: {found}"] * count
+    assert Folder(tmp_path).warnings(f"{DEVICE}outputs: {outputs}\n") == expected
+
+
 NODE = "{type: sparkplug, url: 'mqtt://h', group: g, edge_node: e}"
 
 

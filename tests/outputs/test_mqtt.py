@@ -64,6 +64,21 @@ def test_status_is_online_then_offline(plant: Plant) -> None:
     probe.until("plant/holdfast/status", "offline")
 
 
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+def test_status_is_online_again_if_somebody_else_publishes_offline(
+    plant: Plant, version: str
+) -> None:
+    plant.device()
+    probe = plant.probe("plant/holdfast/status")
+    plant.run(version=version)
+    probe.until("plant/holdfast/status", "online")
+    wire.until(lambda: plant.count("sent") >= 4, "sent")
+    for _ in range(2):
+        plant.broker.publish("plant/holdfast/status", "offline", "-r")
+        probe.until("plant/holdfast/status", "offline")
+        probe.until("plant/holdfast/status", "online")
+
+
 def test_a_device_that_does_not_answer_is_offline(plant: Plant) -> None:
     device = plant.device()
     probe = plant.probe("plant/#")

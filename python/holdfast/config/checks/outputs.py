@@ -97,10 +97,17 @@ def warn_of_outputs(scope: Scope) -> None:
     config = scope.config
     if config.outputs and not any(device.has_tags for device in config.devices.values()):
         scope.report.warn(("outputs",), "has no effect: no device has tags")
+    owners: dict[tuple[str, int, str], str] = {}
     for name, output in config.outputs.items():
         if not isinstance(output, MqttOutputConfig):
             continue
         path: KeyPath = ("outputs", name)
+        status = output.topics.status
+        owner = owners.setdefault((output.host, output.port, status), name)
+        if owner != name:
+            message = f"found {show(status)}, which is the status topic of outputs.{owner}"
+            message += " at the same broker, and can't show both, allowed: a different one"
+            scope.report.warn((*path, "status"), message)
         if given(output, "discovery_prefix") and output.discovery is None:
             scope.report.warn((*path, "discovery_prefix"), "has no effect without discovery")
         if output.discovery is not None and not output.retain:

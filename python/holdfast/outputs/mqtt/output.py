@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
+from math import inf
 from typing import TYPE_CHECKING
 
 from holdfast.outputs.mqtt.availability import OFFLINE, ONLINE, Availability
@@ -23,6 +25,10 @@ if TYPE_CHECKING:
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
     from holdfast.tags import Tag
+
+
+MIN_DENIED_INTERVAL_S = 1.0
+"""Seconds between two repetitions of `online`: another program may answer each with `offline`."""
 
 
 class MqttOutput(BrokerReceiver):
@@ -45,6 +51,9 @@ class MqttOutput(BrokerReceiver):
         self._entities: dict[str, bytes] = {}
         self._found: deque[str] = deque()
         self._is_born = threading.Event()
+        self._is_denied = threading.Event()
+        """Set if somebody else has published that this output is not online."""
+        self._denied_at = -inf
         self._has_sent = True
         """Whether the broker has confirmed values since all were offered again."""
 
@@ -104,6 +113,7 @@ class MqttOutput(BrokerReceiver):
         self._availability.begin()
         self._revision = -1
         self._entities = {}
+        session.subscribe([self._topics.status], retained=False)
         session.publish([self._availability.of_output(ONLINE)])
         # A broker that ends each connection at once must not fill the buffer with repetitions.
         if self._connects > 1 and self._has_sent:
@@ -112,6 +122,11 @@ class MqttOutput(BrokerReceiver):
 
     def _keep_up(self, session: Session) -> None:
         """Publishes what has to be known before values."""
+        now = time.monotonic()
+        if self._is_denied.is_set() and now >= self._denied_at + MIN_DENIED_INTERVAL_S:
+            self._is_denied.clear()
+            self._denied_at = now
+            session.publish([self._availability.of_output(ONLINE)])
         revision = self._site.revision
         if revision != self._revision:
             self._revision = revision
@@ -190,6 +205,11 @@ class MqttOutput(BrokerReceiver):
     def _on_message(self, message: Publish, is_retained: bool) -> None:
         """Takes a message of the broker. Called by the thread of the connection."""
         session = self._session
+        if message.topic == self._topics.status and not is_retained:
+            # As the will of another output with this topic, or a late one of this output.
+            if message.payload != ONLINE:
+                self._is_denied.set()
+            return
         if session is None or self._commands.take(message, session, is_retained=is_retained):
             return
         if self._discovery is None:
