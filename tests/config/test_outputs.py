@@ -193,11 +193,9 @@ MQTT = "type: mqtt, url: 'mqtt://h'"
         (f"{{o: {{{MQTT}}}, p: {{type: mqtt, url: 'mqtt://other'}}}}", 0),
     ],
 )
-def test_outputs_at_one_broker_need_a_status_each(
-    tmp_path: Path, outputs: str, count: int
-) -> None:
-    found = "outputs.p.status: found 'plant/holdfast/status', which is the status topic of outputs.o"
-    found += " at the same broker, and can't show both, allowed: a different one"
+def test_outputs_at_one_broker_need_a_status_each(tmp_path: Path, outputs: str, count: int) -> None:
+    found = "outputs.p.status: found 'plant/holdfast/status', which is the status topic of "
+    found += "outputs.o at the same broker, and can't show both, allowed: a different one"
     expected = [f"p.yaml:2: {found}"] * count
     assert Folder(tmp_path).warnings(f"{DEVICE}outputs: {outputs}\n") == expected
 

@@ -13,6 +13,11 @@ from hypothesis import strategies as st
 from holdfast.outputs import Buffer
 from holdfast.outputs.buffer import MAX_ROW
 from holdfast.outputs.buffer_file import Stored
+from holdfast.outputs.line_protocol import lines
+from holdfast.outputs.tag_meaning import meaning_of
+from holdfast.tags import Tag
+from holdfast.tags.scale import RegisterScale
+from holdfast.tags.text import text_of
 from support import wire
 from support.cases import examples
 from support.readings import numbered, numbers, polls, reading, tag
@@ -207,11 +212,15 @@ def test_values_of_every_kind_survive_in_a_file(opened: Opened, tmp_path: Path) 
     ("value", "kind"),
     [(True, "bool"), (1.5, "float64"), (None, "float64"), ("a", "string:2"), ([b"a"], "bytes:2")],
 )
-def test_a_tag_that_is_gone_is_replaced_by_one_of_its_kind(
+def test_a_tag_that_was_not_stored_is_replaced_by_one_of_its_kind(
     opened: Opened, tmp_path: Path, value: Any, kind: str
 ) -> None:
+    """As in files of earlier versions."""
     stored = opened(tmp_path / "b.db", known=[])
     stored.add([[reading(value, tag=tag("gone"))]])
+    stored._db.execute("DROP TABLE tags")
+    stored.close()
+    stored = opened(tmp_path / "b.db", known=[])
     [found] = stored.first(1)
     assert (found.name, found.tag.type, found.value) == ("gone", kind, value)
 
@@ -339,15 +348,46 @@ def test_a_value_of_a_changed_tag_keeps_its_meaning(opened: Opened, tmp_path: Pa
     before = tag("t", type="uint16", scale=0.1, description="before")
     stored.add([[reading(21.5, tag=before)]])
     stored.close()
-    for now, kind in (
-        (tag("t", type="uint16"), "float64"),
-        (tag("t", type="uint16", scale=0.1, unit="V"), "float64"),
-        (tag("t", type="uint16", scale=0.1, description="after"), "uint16"),
+    for now in (
+        tag("other"),
+        tag("t", type="uint16"),
+        tag("t", type="float32", unit="V"),
+        tag("t", type="uint16", scale=0.1, description="after"),
     ):
         again = opened(tmp_path / "b.db", known=[now])
         [found] = again.first(1)
-        assert (found.value, found.tag.type) == (21.5, kind)
+        assert (found.value, found.tag.type, found.tag.scale) == (21.5, "uint16", 0.1)
         again.close()
+
+
+SCALE = tag("exponent", type="int16")
+
+
+@pytest.mark.parametrize(
+    ("value", "before"),
+    [
+        (5, tag(type="uint64", unit="kWh")),
+        (1, tag(type="uint16", states={0: "off", 1: "running"})),
+        (True, Tag("t", "coils", 3, states={0: "off", 1: "on"})),
+        (True, Tag("t", "holding_registers", 3, "bit:4")),
+        ([1, None], tag(type="int32[2]", scale=10**30, offset=-0.5)),
+        (21, tag(type="uint16", scale=RegisterScale("exponent", source=SCALE))),
+        (21, tag(type="uint16", scale=RegisterScale("factor", "exponent", SCALE))),
+        ("a", tag(type="string:4", encoding="utf-8")),
+    ],
+    ids=["uint64", "states", "coil", "bit", "array", "exponent", "factor", "text"],
+)
+def test_a_value_of_a_changed_tag_is_sent_as_it_was(
+    opened: Opened, tmp_path: Path, value: Any, before: Tag
+) -> None:
+    """InfluxDB refuses a field that changes its kind."""
+    stored = opened(tmp_path / "b.db", known=[tag("t", type="string:2")])
+    stored.add([[reading(value, tag=before)]])
+    [found] = stored.first(1)
+    assert found.tag.type == before.type
+    assert meaning_of(found.tag) == meaning_of(before)
+    assert lines([found], "m", {}) == lines([reading(value, tag=before)], "m", {})
+    assert text_of(found.tag, value) == text_of(before, value)
 
 
 @settings(max_examples=examples(60), deadline=None)

@@ -336,8 +336,8 @@ def test_two_outputs_never_share_a_buffer() -> None:
     """As after a reload, while the receiver before holds up the end of its output."""
     before, goes_on = Running(), threading.Event()
 
-    def slow(_: list[Reading]) -> None:
-        before.receiver.attempts += 1
+    def slow(readings: list[Reading]) -> None:
+        before.receiver.attempts += len(readings)
         goes_on.wait(wire.DEADLINE)
         raise OSError("down")
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.outputs.tag_meaning import meaning_of
+from holdfast.outputs.tag_meaning import described, meaning_of, tag_from
 from holdfast.polling import Reading
 from holdfast.tags import Tag
 
@@ -28,7 +28,10 @@ LOCK_TIMEOUT_S = 1.0
 _CREATE = """
 CREATE TABLE IF NOT EXISTS readings (
     id INTEGER PRIMARY KEY AUTOINCREMENT, count INTEGER NOT NULL, data BLOB NOT NULL
-)"""
+);
+CREATE TABLE IF NOT EXISTS tags (meaning INTEGER PRIMARY KEY, description TEXT NOT NULL)
+"""
+"""`tags` is for readings whose tag is changed or removed before they are sent."""
 
 
 class Stored:
@@ -47,6 +50,10 @@ class Stored:
         """How many readings were removed because they could not be read."""
         self._max_bytes, self._find = max_bytes, find
         self._bytes = 0
+        self._described: set[int] = set()
+        """The meanings that are in the file for sure."""
+        self._earlier: dict[tuple[str, int], Tag] = {}
+        """Tags as they were when their readings were stored."""
         self._last = 0
         """The last row that `first` returned."""
         with file_errors(file):
@@ -57,7 +64,7 @@ class Stored:
             # Two processes with one file would each send the readings of the other.
             self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
-            self._db.execute(_CREATE)
+            self._db.executescript(_CREATE)
             self._recount()
 
     def add(self, rows: Sequence[Sequence[Reading]]) -> int:
@@ -68,6 +75,11 @@ class Stored:
         # Once for each tag: most readings share theirs.
         tags = {id(reading.tag): reading.tag for row in rows for reading in row}
         meanings = {of: meaning_of(tag) for of, tag in tags.items()}
+        new = {
+            meanings[of]: described(tag)
+            for of, tag in tags.items()
+            if meanings[of] not in self._described
+        }
         encoded = [
             msgspec.msgpack.encode(
                 [
@@ -80,6 +92,7 @@ class Stored:
         # The rollback may undo what is counted here.
         with file_errors(self.file, self._recount), self._db:
             self._db.execute("BEGIN")
+            self._db.executemany("INSERT OR IGNORE INTO tags VALUES (?, ?)", new.items())
             for count, data in zip(map(len, rows), encoded, strict=True):
                 while self._bytes + len(data) > self._max_bytes and self.count:
                     dropped += self._remove("id = (SELECT min(id) FROM readings)")
@@ -89,6 +102,7 @@ class Stored:
                 self._db.execute("INSERT INTO readings (count, data) VALUES (?, ?)", (count, data))
                 self.count += count
                 self._bytes += len(data)
+        self._described |= new.keys()
         return dropped
 
     def first(self, most: int) -> list[Reading]:
@@ -160,8 +174,19 @@ class Stored:
     ) -> Reading:
         tag = self._find(device, name)
         if tag is None or meaning != meaning_of(tag):
-            tag = _stand_in(name, value)
+            tag = self._as_stored(name, meaning) or _stand_in(name, value)
         return Reading(device, tag, value, time, fault, undecoded)
+
+    def _as_stored(self, name: str, meaning: int) -> Tag | None:
+        """A tag as it was. `None` in files of versions that did not store that."""
+        if (known := self._earlier.get((name, meaning))) is not None:
+            return known
+        query = "SELECT description FROM tags WHERE meaning = ?"
+        with file_errors(self.file):
+            row = self._db.execute(query, (meaning,)).fetchone()
+        if row is None:
+            return None
+        return self._earlier.setdefault((name, meaning), tag_from(name, row[0]))
 
 
 @contextlib.contextmanager
