@@ -95,6 +95,27 @@ def test_a_device_that_does_not_answer_is_offline(plant: Plant) -> None:
         probe.until("plant/pump/temperature", "10.0")
 
 
+def test_what_another_output_after_a_reload_does_not_publish_is_removed(plant: Plant) -> None:
+    plant.device()
+    plant.device("fan")
+    probe = plant.probe("plant/#")
+    appliance = plant.run(COUNTED)
+
+    def until_removed(*topics: str) -> None:
+        left = set(topics)
+        while left:
+            message = probe.get()
+            if not message.payload:
+                left.remove(message.topic)
+
+    probe.until("plant/fan/n", "0")
+    appliance.reload(plant.config({"devices": ["pump"]}, COUNTED))
+    until_removed("plant/fan/n", "plant/holdfast/status/fan")
+    wire.until(lambda: plant.count("sent") >= 1, "the other device is published")
+    appliance.reload(plant.config({"topic": "site/{device}/{tag}"}, COUNTED))
+    until_removed("plant/pump/n", "plant/holdfast/status/pump", "plant/holdfast/status")
+
+
 def test_json_has_value_time_unit_and_state(plant: Plant) -> None:
     device = plant.device()
     device.set(215)

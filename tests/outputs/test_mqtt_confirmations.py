@@ -20,7 +20,7 @@ from holdfast.outputs.mqtt import MqttOutput, session
 from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES
 from holdfast.runtime.stop import Stop
 from support import wire
-from support.mqtt_peer import CONNECT, DISCONNECT, PUBLISH, FakeBroker, Peer
+from support.mqtt_peer import CONNECT, DISCONNECT, PUBACK, PUBLISH, FakeBroker, Peer, acknowledge
 from support.readings import TIME, numbered, reading, tag
 
 if TYPE_CHECKING:
@@ -83,6 +83,7 @@ class Site:
 
     def __init__(self) -> None:
         self.refreshed = 0
+        self.retained: dict[tuple[str, str], str] = {}
 
     def tags(self) -> dict[str, Any]:
         return {}
@@ -206,6 +207,47 @@ def test_a_device_that_is_removed_while_its_values_wait_is_forgotten(stop: Stop)
     output.close()
     broker.thread.join()
     assert [[message["values"] for message in seen] for seen in broker.seen] == [[], [{"t": 2}]]
+
+
+def test_a_removal_is_repeated_until_it_is_confirmed(stop: Stop) -> None:
+    """Also by another output of the same name, as after a reload."""
+    site = Reloaded(pump=[tag()], fan=[tag()])
+
+    def idle() -> None:
+        with contextlib.suppress(OSError):
+            output.idle()
+
+    def is_forgotten() -> bool:
+        output.idle()
+        return len(site.retained) == 3
+
+    with FakeBroker() as broker, ThreadPoolExecutor(1) as threads:
+        output = made(broker, site, stop)
+        for confirms in (False, False, True):
+            begun = threads.submit(idle)
+            with broker.accept() as peer:
+                peer.expect(CONNECT)
+                peer.connack()
+                begun.result()
+                if len(site.tags()) > 1:
+                    site.reload(pump=[tag()])
+                    output.idle()
+                while b"plant/fan/t" not in (packet := peer.receive()).body:
+                    pass
+                assert packet.kind == PUBLISH
+                if confirms:
+                    start = 2 + packet.body[1]
+                    count = int.from_bytes(packet.body[start : start + 2])
+                    for each in range(count - 5, count + 1):
+                        peer.send(acknowledge(PUBACK, each))
+                    wire.until(is_forgotten, "confirmed")
+            output.close()
+            output = made(broker, site, stop)
+    assert {topic for _, topic in site.retained} == {
+        "plant/holdfast/status",
+        "plant/holdfast/status/pump",
+        "plant/pump/t",
+    }
 
 
 def kinds_until_closed(peer: Peer) -> set[int]:

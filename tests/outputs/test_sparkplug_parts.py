@@ -6,7 +6,7 @@ import contextlib
 import math
 import struct
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
 from hypothesis import given
@@ -470,6 +470,7 @@ class Pump:
     """A site with one device, which answers."""
 
     revision = answers = 0
+    retained: ClassVar[dict[tuple[str, str], str]] = {}
 
     def tags(self) -> dict[str, Any]:
         return {"pump": [SPEED]}

@@ -61,6 +61,12 @@ class Site(Protocol):
     def latest(self) -> Sequence[Reading]:
         """The last reading of each tag."""
 
+    @property
+    def retained(self) -> dict[tuple[str, str], str]:
+        """The name of the output that has published a topic, by broker and topic, until it was
+        removed there. All outputs share it, so that one goes on after a reload where another ended.
+        """
+
     def refresh(self) -> None:
         """Has the last value of each tag published again, and those not known yet once they are."""
 

@@ -115,6 +115,8 @@ class TagValues:
         """Changes with the tags of any device, and with `devices`."""
         self.devices: dict[str, DeviceInfo] = {}
         """What is known of each device with tags. Replaced as a whole."""
+        self.retained: dict[tuple[str, str], str] = {}
+        """Of each broker and topic that it retains, the output that published it: see `Site`."""
         self.answers = 0
         """Changes when a device stops to answer, or answers again."""
         self._heartbeat = Heartbeat()

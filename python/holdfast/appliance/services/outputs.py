@@ -78,6 +78,10 @@ class _Site:
     def latest(self) -> list[Reading]:
         return [reading for reading in self._values.latest() if self._has(reading.device)]
 
+    @property
+    def retained(self) -> dict[tuple[str, str], str]:
+        return self._values.retained
+
     def _has(self, device: str) -> bool:
         return self._only is None or device in self._only
 

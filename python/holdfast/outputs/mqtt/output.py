@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.outputs import MqttOutputConfig
     from holdfast.net.mqtt.packets import Publish
     from holdfast.outputs.device_access import Site
+    from holdfast.outputs.mqtt.delivery import Delivery
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
     from holdfast.tags import Tag
@@ -43,6 +44,8 @@ class MqttOutput(BrokerReceiver):
         self._messages: Sequence[Message] = ()
         self._commands = Commands(name, self._broker, self._topics, site)
         self._tags: dict[str, set[str]] = {}
+        self._removal: Delivery | None = None
+        """Of topics that are gone, until the broker has confirmed it."""
         # Home Assistant looks at availability only after discovery, so it must be retained. A will
         # that is retained would keep a broker without retained messages from any connection.
         self._retains = settings.retain or settings.discovery is not None
@@ -127,6 +130,7 @@ class MqttOutput(BrokerReceiver):
             self._is_denied.clear()
             self._denied_at = now
             session.publish([self._availability.of_output(ONLINE)])
+        self._forget_removed()
         revision = self._site.revision
         if revision != self._revision:
             self._revision = revision
@@ -148,9 +152,8 @@ class MqttOutput(BrokerReceiver):
             self._payloads.settle(sent=False)
             self._taken, self._messages = [], ()
             self._payloads.keep_only(names)
-        gone = dict.fromkeys(self._topics_of(self._tags) - self._topics_of(names), b"")
         self._tags = names
-        self._publish(session, gone)
+        self._removal = self._publish(session, self._gone())
         self._availability.keep(names.keys())
         if self._discovery is None:
             return
@@ -167,10 +170,33 @@ class MqttOutput(BrokerReceiver):
         if not before:
             session.subscribe([self._discovery.filter], retained=True)
 
+    def _gone(self) -> dict[str, bytes]:
+        """Messages that remove what this output, or the one before it, has published and does not
+        publish any more. Another output may do so now: that topic stays.
+        """
+        retained, wanted = self._site.retained, self._topics_of(self._tags)
+        for topic in wanted:
+            retained[self._broker, topic] = self._name
+        known = [*retained.items()]  # A copy, because other outputs change it at any time.
+        own = {topic for (at, topic), name in known if (at, name) == (self._broker, self._name)}
+        return dict.fromkeys(own - wanted, b"")
+
+    def _forget_removed(self) -> None:
+        """Forgets topics once the broker has confirmed that they are removed."""
+        removal = self._removal
+        if removal is None or not removal.is_done:
+            return
+        self._removal = None
+        for topic in (message.topic[2:].decode() for message in removal.messages):
+            if self._site.retained.get((self._broker, topic)) == self._name:
+                del self._site.retained[self._broker, topic]
+
     def _topics_of(self, tags: Mapping[str, set[str]]) -> set[str]:
-        """The retained topics of devices and tags."""
+        """The retained topics of the output, its devices and tags."""
         names = self._topics
-        found = {names.of_availability(device) for device in tags if self._retains}
+        found: set[str] = set()
+        if self._retains:
+            found = {names.status, *map(names.of_availability, tags)}
         if not self._settings.retain:
             return found
         if self._settings.payload == "device":
@@ -187,10 +213,11 @@ class MqttOutput(BrokerReceiver):
         self._publish(session, stale)
 
     @staticmethod
-    def _publish(session: Session, retained: Mapping[str, bytes]) -> None:
-        if retained:
-            messages = retained.items()
-            session.publish([Message(packed_topic(key), text, True) for key, text in messages])
+    def _publish(session: Session, retained: Mapping[str, bytes]) -> Delivery | None:
+        if not retained:
+            return None
+        messages = retained.items()
+        return session.publish([Message(packed_topic(key), text, True) for key, text in messages])
 
     def _disconnect(self, *last: Message) -> None:
         """Ends the session, if there is one. Without a last message, the broker sends the will."""
