@@ -198,6 +198,27 @@ def test_a_receiver_that_can_not_be_reached_delays_nothing_else(
     assert kept == values(tmp_path, "power")
 
 
+@pytest.mark.parametrize("after", [{}, {"buffer": {"file": "other.db"}}], ids=["none", "other"])
+def test_values_in_a_file_that_a_reload_takes_away_are_logged(
+    tmp_path: Path, device: int, caplog: pytest.LogCaptureFixture, after: dict[str, Any]
+) -> None:
+    made = settings(device)
+    down = {"type": "influx", "url": "http://127.0.0.1:9", "bucket": "b"}
+    made["outputs"] = {"down": {**down, "buffer": {"file": "down.db"}}}
+    with Appliance(load(saved(tmp_path, made))) as appliance:
+        status = appliance.diagnostics.adapter
+        wire.until(lambda: (status("output/down") or {}).get("waiting") == 4, "all wait")
+        made["outputs"] = {"down": down | after}
+        appliance.reload(load(saved(tmp_path, made)))
+    # At the end, values wait in a file for the next start.
+    [record] = [each for each in caplog.records if each.message == "output_file_left"]
+    stored = Stored(tmp_path / "down.db", 2**30, lambda _, name: tag(name))
+    stored.close()
+    expected = {"output": "down", "file": str(stored.file), "count": stored.count}
+    assert vars(record)["fields"] == expected
+    assert stored.count >= 4
+
+
 def test_a_reload_changes_tags_and_outputs_and_loses_nothing(
     tmp_path: Path, device: int, memory: holdfast.Memory
 ) -> None:

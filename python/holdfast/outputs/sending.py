@@ -87,7 +87,10 @@ def soon_after(stop: Stop, end: Callable[[], None]) -> None:
 
 
 class Sending:
-    """An adapter that sends what is in a buffer to a receiver."""
+    """An adapter that sends what is in a buffer to a receiver.
+
+    At its end, `leaves_file` tells whether no output uses the file any more.
+    """
 
     def __init__(
         self,
@@ -95,9 +98,10 @@ class Sending:
         receiver: Receiver,
         buffer: Buffer,
         open_file: Callable[[], Stored] | None = None,
+        leaves_file: Callable[[], bool] = bool,
     ) -> None:
         self._name, self._receiver, self._buffer = name, receiver, buffer
-        self._open_file = open_file
+        self._open_file, self._leaves_file = open_file, leaves_file
         self._sent = self._refused = 0
         self._logged_dropped, self._logged_at = buffer.dropped, -inf
         self._looked_at = -inf
@@ -136,6 +140,7 @@ class Sending:
             raise
         finally:
             self._receiver.close()
+            self._log_left()
             self._buffer.detach()
 
     def status(self) -> dict[str, object]:
@@ -260,6 +265,17 @@ class Sending:
         if lost > 0 and now >= self._logged_at + every:
             self._logged_dropped, self._logged_at = self._logged_dropped + lost, now
             log_lines.write(logging.WARNING, "output_dropped", output=self._name, count=lost)
+
+    def _log_left(self) -> None:
+        stored = self._buffer.stored
+        if stored is not None and stored.count and self._leaves_file():
+            log_lines.write(
+                logging.WARNING,
+                "output_file_left",
+                output=self._name,
+                file=str(stored.file),
+                count=stored.count,
+            )
 
     @contextlib.contextmanager
     def _using_file(self) -> Iterator[None]:

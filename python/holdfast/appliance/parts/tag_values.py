@@ -198,7 +198,11 @@ class TagValues:
             assert file is not None, "called only with a file"
             return Stored(file, settings.max_bytes, self.find)
 
-        return Sending(name, receiver(), output.buffer, None if file is None else opened)
+        def leaves() -> bool:
+            now = self._outputs.get(name)
+            return now is None or now.settings.buffer.file != file
+
+        return Sending(name, receiver(), output.buffer, None if file is None else opened, leaves)
 
     def find(self, device: str, tag: str) -> Tag | None:
         """A tag of the configuration."""
