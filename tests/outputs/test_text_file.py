@@ -140,13 +140,28 @@ def test_a_file_that_is_moved_is_written_again(tmp_path: Path) -> None:
     assert (tmp_path / "a.csv").read_text("utf-8") == (tmp_path / "b.csv").read_text("utf-8")
 
 
-def test_a_line_that_a_crash_has_cut_off_is_ended(tmp_path: Path) -> None:
-    (tmp_path / "a.jsonl").write_text('{"time":"2023')
-    file = TextFile(settings(tmp_path / "a.jsonl", "jsonl"))
-    file.send(READINGS[:1])
-    file.close()
-    cut, whole = (tmp_path / "a.jsonl").read_text("utf-8").splitlines()
-    assert (cut, json.loads(whole)["value"]) == ('{"time":"2023', 21.5)
+@pytest.mark.parametrize("lines", [0, 1, 2])
+@pytest.mark.parametrize("kind", ["csv", "jsonl", "influx"])
+def test_a_line_that_a_crash_has_cut_off_is_removed(
+    tmp_path: Path, kind: str, lines: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Half of a value can be a wrong one, such as 15 of 1520.5."""
+    path = tmp_path / "a"
+
+    def send() -> list[bytes]:
+        file = TextFile(settings(path, kind))
+        for number in range(3):
+            file.send([reading(1520.5 + number)])
+        file.close()
+        return path.read_bytes().splitlines(keepends=True)
+
+    whole = send()
+    path.write_bytes(b"".join(whole[:lines]) + whole[lines][:-5])
+    expected = whole[:lines] + (whole[1:] if kind == "csv" and lines else whole)
+    assert send() == expected
+    [record] = caplog.records
+    fields = {"file": str(path), "bytes": len(whole[lines]) - 5}
+    assert (record.message, vars(record)["fields"]) == ("output_line_cut", fields)
 
 
 def test_what_a_full_disk_cuts_off_is_removed(tmp_path: Path) -> None:

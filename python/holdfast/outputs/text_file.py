@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 import os
 from datetime import UTC, datetime
+from mmap import ACCESS_READ, mmap
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -70,7 +72,7 @@ class TextFile(Receiver):
         if self._open is None:
             self._rotation.take_up()
             self._open = self._file.open("ab", buffering=0)
-            _end_line(self._open, self._file)
+            _cut_line(self._open, self._file)
         size = self._open.seek(0, os.SEEK_END)
         if size and size + more > self._max_bytes and self._rotation.is_due:
             self.close()
@@ -89,14 +91,16 @@ def _is_same(file: io.FileIO, path: Path) -> bool:
         return False
 
 
-def _end_line(file: io.FileIO, path: Path) -> None:
-    """Ends a line that a crash has cut off."""
+def _cut_line(file: io.FileIO, path: Path) -> None:
+    """Removes a line that a crash has cut off: half of a value can be a wrong one."""
     size = file.seek(0, os.SEEK_END)
-    if size:
-        with path.open("rb") as reading:
-            reading.seek(size - 1)
-            if reading.read(1) != b"\n":
-                file.write(b"\n")
+    if not size:
+        return
+    with path.open("rb") as reading, mmap(reading.fileno(), 0, access=ACCESS_READ) as data:
+        whole = data.rfind(b"\n") + 1
+    if whole < size:
+        file.truncate(whole)
+        log_lines.write(logging.WARNING, "output_line_cut", file=str(path), bytes=size - whole)
 
 
 def row(reading: Reading) -> tuple[Any, ...]:
