@@ -352,6 +352,10 @@ def test_a_signal_leaves_a_whole_recording(
         (("hr", "0", "--csv"), "--csv requires AREA:ADDRESS or --tags."),
         (("hr", "0", "--record", "x.csv"), "--record requires AREA:ADDRESS or --tags."),
         (("--profile", "x"), "--profile requires --tags."),
+        (
+            ("--config", __file__, "--profile", "x"),
+            "--config can't be used with --tags or --profile.",
+        ),
         (("--tags", "x.csv", "--modicon"), "--modicon can't be used with tags."),
     ],
 )

@@ -175,6 +175,13 @@ def test_every_request_of_a_device_may_have_tls() -> None:
         assert fields["serverName"]["type"] == "string", path
 
 
+@pytest.mark.parametrize(("path", "most"), [("/write/registers", 123), ("/write/coils", 1968)])
+def test_an_answer_has_no_larger_quantity_than_its_request(path: str, most: int) -> None:
+    answers = DOCUMENT["paths"][gateways.API + path]["post"]["responses"]["200"]["content"]
+    properties, *_ = answers["application/json"]["schema"]["oneOf"]
+    assert properties["properties"]["quantity"]["maximum"] == most
+
+
 @pytest.fixture
 def default_gateway() -> Iterator[Running]:
     with serving() as running:

@@ -691,6 +691,14 @@ def test_serial_lines_have_no_broadcasts(imported: Callable[[str], Imported]) ->
     ]
 
 
+def test_a_global_tag_may_be_named_tags(imported: Callable[[str], Imported]) -> None:
+    text = REGISTER + '[global_tags]\n  tags = "$SITE"\n' + OUTPUT
+    assert problems(imported, text) == [
+        "17: global_tags.tags: found the environment variable SITE, which the source replaces, "
+        "allowed: its value"
+    ]
+
+
 def test_an_output_for_influxdb(imported: Callable[[str], Imported]) -> None:
     tags = '[global_tags]\n  site = "north"\n  "a b" = "x"\n  device = "y"\n'
     found = imported(REGISTER + tags + OUTPUT)

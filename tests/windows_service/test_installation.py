@@ -143,11 +143,11 @@ def test_errors_of_windows_say_what_to_do(windows: fake_windows.Windows, file: P
     [missing] = failure("service", "start", str(file))
     assert missing == (
         "holdfast: can't start the service holdfast-my-plant: The specified service does not exist "
-        "as an installed service. install it with 'holdfast service install'"
+        "as an installed service: install it with 'holdfast service install'"
     )
     done("service", "install", str(file))
     [twice] = failure("service", "install", str(file))
-    assert "already exists. remove it first, or install this one with another --name" in twice
+    assert "already exists: remove it first, or install this one with another --name" in twice
     done("service", "start", str(file))
     assert failure("service", "start", str(file)) == [
         "holdfast: can't start the service holdfast-my-plant: "
@@ -155,7 +155,7 @@ def test_errors_of_windows_say_what_to_do(windows: fake_windows.Windows, file: P
     ]
     windows.is_administrator = False
     [denied] = failure("service", "remove", str(file))
-    assert "Access is denied. run this command in a terminal of an administrator" in denied
+    assert "Access is denied: run this command in a terminal of an administrator" in denied
 
 
 @pytest.mark.parametrize("command", ["install", "remove", "start", "stop", "reload", "host"])

@@ -126,7 +126,7 @@ class InstalledService:
             yield
         except pywintypes.error as error:
             hint = HINTS.get(error.winerror)
-            reason = error.strerror.rstrip(".") if hint is None else f"{error.strerror} {hint}"
+            reason = error.strerror.rstrip(".") + (f": {hint}" if hint else "")
             raise ServiceError(f"can't {verb} the service {self.name}: {reason}") from error
 
 

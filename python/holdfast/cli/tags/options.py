@@ -81,7 +81,7 @@ class TagFiles:
 
         if self.config is not None:
             if self.tags is not None or self.profile is not None:
-                raise click.UsageError("--config and --tags can't be used together.")
+                raise click.UsageError("--config can't be used with --tags or --profile.")
             return files.configured(self.config, url, unit, timeout)
         if self.tags is None:
             raise click.UsageError("--profile requires --tags.")

@@ -18,7 +18,7 @@ from holdfast.gateway.fields import (
     WRITE_TIMEOUT_MS,
 )
 from holdfast.net.http.fields import Field, malformed
-from holdfast.net.http.schemas import BOOLEAN, array, integer
+from holdfast.net.http.schemas import BOOLEAN, Schema, array, integer
 from holdfast.protocol import (
     ADDRESSES,
     LAST_ADDRESS,
@@ -112,7 +112,10 @@ def _values(items: dict[str, Any], most: int, text: str) -> Field:
 REGISTER_VALUES = _values(REGISTER, WRITE_REGISTERS, "")
 """What `values` must be without a datatype. The schema of the request allows values of any type."""
 
-_WRITTEN = {"startAddress": ADDRESS_SCHEMA, "quantity": integer(1, WRITE_BITS)}
+
+def _written(most: int) -> dict[str, Schema]:
+    return {"startAddress": ADDRESS_SCHEMA, "quantity": integer(1, most)}
+
 
 _write = partial(Endpoint, writes=always, broadcast=True, timeout_ms=WRITE_TIMEOUT_MS)
 
@@ -151,7 +154,7 @@ ENDPOINTS = (
             BYTE_ORDER,
         ),
         carry_out=_write_registers,
-        properties=_WRITTEN,
+        properties=_written(WRITE_REGISTERS),
         examples={
             "Three registers": {**EXAMPLE, "address": 100, "values": [1000, 2000, 3000]},
             "A float, low word first": {
@@ -185,7 +188,7 @@ ENDPOINTS = (
             _values(BIT, WRITE_BITS, f"Up to {WRITE_BITS} of `true`, `false`, 1, 0"),
         ),
         carry_out=_write_coils,
-        properties=_WRITTEN,
+        properties=_written(WRITE_BITS),
         examples={"Three coils": {**EXAMPLE, "address": 16, "values": [True, False, True]}},
         answer={"startAddress": 16, "quantity": 3},
     ),

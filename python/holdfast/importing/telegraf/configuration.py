@@ -102,7 +102,8 @@ def _texts(path: KeyPath, value: Any) -> Iterator[tuple[KeyPath, str]]:
     elif isinstance(value, dict | list):
         inside = value.items() if isinstance(value, dict) else enumerate(value)
         for key, each in inside:
-            if key != "tags":
+            # Tags of an input or of a part of it are not converted.
+            if key != "tags" or path[0] != "inputs":
                 yield from _texts((*path, key), each)
 
 
@@ -194,9 +195,10 @@ class _Import:
                 self.desk.left_out(each.measured_at, message)
 
     def _global_tags(self, tags: Section | None) -> dict[str, str]:
+        if tags is None:
+            return {}
         found = {}
-        for key in tags.data if tags is not None else ():
-            assert tags is not None, "there are keys"
+        for key in tags.data:
             value = tags.get(key)
             if not is_name(key):
                 self.desk.left_out(tags.at(key), f"a tag of an output has {NAME_FORM}")
