@@ -26,14 +26,19 @@ ROW = "{:>4}  {:7}  {}"
 """A row of the table: unit id, answer, identification."""
 
 
-def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_json: bool) -> None:
-    """Finds unit ids, prints them, and exits with 1 if there are none."""
+def find_units(
+    url: str, unit_ids: Sequence[int], timeout: float, delay: float, as_json: bool
+) -> None:
+    """Finds unit ids and prints them.
+
+    Exits with 1 if there are none, or if the search ended early.
+    """
     is_line = isinstance(parse(url), SerialTarget)
     if is_line:
-        refuse_broadcast(asked)
+        refuse_broadcast(unit_ids)
     if sys.stderr.isatty():
-        most = len(asked) * (timeout + delay)
-        click.echo(f"{len(asked)} unit ids, at most {most:.0f} s. Ctrl-C stops.", err=True)
+        most = len(unit_ids) * (timeout + delay)
+        click.echo(f"{len(unit_ids)} unit ids, at most {most:.0f} s. Ctrl-C stops.", err=True)
     found: list[Unit] = []
     with interruptions() as signals:
         report = Report({"target": url} if as_json else None, signals)
@@ -41,8 +46,8 @@ def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_
 
         def search() -> None:
             nonlocal ignores
-            with report.progress("Finding", len(asked), lambda: f"{_count(found)} found"):
-                for unit in device_search.units(client, asked, delay=delay):
+            with report.progress("Finding", len(unit_ids), lambda: f"{_count(found)} found"):
+                for unit in device_search.units(client, unit_ids, delay=delay):
                     with report.held():
                         found.append(unit)
                         if unit.answers:
@@ -50,10 +55,10 @@ def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_
                         report.advance(len(found))
                 ignores = device_search.ignores_unit(client, found, is_line=is_line, delay=delay)
 
-        with device.connect(url, asked[0], timeout) as client:
+        with device.connect(url, unit_ids[0], timeout) as client:
             why = report.attempt(search, url, lambda: _count(found))
-        left = asked[len(found) :]
-        report.text(*_units(url, found, left, ignores))
+        not_asked = unit_ids[len(found) :]
+        report.text(*_units(url, found, not_asked, ignores))
         report.end(
             {
                 **ended_to_json(why or (None if _count(found) else NOTHING)),
@@ -61,7 +66,7 @@ def find_units(url: str, asked: Sequence[int], timeout: float, delay: float, as_
                 "garbled": _garbled(found),
                 "ignores_unit": ignores,
                 "asked": [each.unit for each in found],
-                "not_asked": list(left),
+                "not_asked": list(not_asked),
             }
         )
     if why is not None and not as_json:
@@ -96,7 +101,7 @@ def unit_to_json(found: Unit) -> dict[str, object]:
     }
 
 
-def _units(url: str, found: Sequence[Unit], left: Sequence[int], ignores: bool) -> list[str]:
+def _units(url: str, found: Sequence[Unit], not_asked: Sequence[int], ignores: bool) -> list[str]:
     """The summary at the end of the search."""
     count = _count(found)
     silent = [each.unit for each in found if not each.answers and not each.is_garbled]
@@ -106,8 +111,8 @@ def _units(url: str, found: Sequence[Unit], left: Sequence[int], ignores: bool) 
         lines.append(f"no device: {number_ranges(silent)}")
     if garbled := _garbled(found):
         lines.append(f"invalid replies: {number_ranges(garbled)}")
-    if left:
-        lines.append(f"not asked: {number_ranges(left)}")
+    if not_asked:
+        lines.append(f"not asked: {number_ranges(not_asked)}")
     if ignores:
         lines.append("The device answers every unit id: it probably ignores them.")
     return lines

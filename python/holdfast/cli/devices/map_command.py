@@ -170,18 +170,18 @@ def _line(found: AreaMap, span: range, cells: int) -> str:
     A cell is empty if none of its addresses was asked.
     """
     blocks, absent = (BLOCKS, ABSENT) if terminal_text.fits(BLOCKS + ABSENT) else ASCII
-    asked = _counts(found.absent, span, cells)
+    missing = _counts(found.absent, span, cells)
     there = _counts(found.ranges, span, cells)
     failed = _counts((each for some in found.failures.values() for each in some), span, cells)
     line = []
     for cell in range(cells):
         first, stop = _bounds(span, cells, cell)
         if there[cell]:
-            full = there[cell] == stop - first
-            level = len(blocks) - 1 if full else there[cell] * (len(blocks) - 1) // (stop - first)
+            # Only a full cell has the highest block.
+            level = there[cell] * (len(blocks) - 1) // (stop - first)
             line.append(terminal_text.styled(blocks[level], fg="green"))
         else:
-            nothing = absent if asked[cell] else NOT_ASKED
+            nothing = absent if missing[cell] else NOT_ASKED
             line.append(terminal_text.styled("!", fg="red") if failed[cell] else nothing)
     return "".join(line).rstrip()
 
