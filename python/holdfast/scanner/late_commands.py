@@ -60,5 +60,5 @@ class Lateness:
             connected = client()
             if connected is not None:
                 with contextlib.suppress(Error, OSError):  # A new connection is pinged, too.
-                    await connected.prove(since=self._standstill.ended)
+                    await connected.ping_unless_pinged(since=self._standstill.ended)
             await asyncio.sleep(self._standstill.look_interval_s)

@@ -68,7 +68,7 @@ async def _status(name: str, servers: Servers, as_json: bool, watch: bool) -> bo
         while True:
             await asyncio.sleep(_SAMPLE_INTERVAL_S)
             now, seconds = await observer.look(), time.monotonic() - at
-            shown = now.shown(before, seconds)
+            shown = now.to_json(before, seconds)
             if as_json:
                 seen = {key: value for key, value in shown.items() if key != "fleet"}
                 print_json({"ok": True, "target": name, **seen})

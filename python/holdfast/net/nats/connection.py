@@ -312,7 +312,7 @@ async def connected_once(
 async def _given_up(client: SafeClient, ended: asyncio.Event) -> None:
     """Returns when nats-py has closed a client, or connects no more. It does not always call the
     callback."""
-    while not (ended.is_set() or client.is_closed or client.is_left):
+    while not (ended.is_set() or client.is_closed or client.has_stopped_reconnecting):
         await tasks.within(CHECK_INTERVAL_S, ended.wait())
     ended.set()
 

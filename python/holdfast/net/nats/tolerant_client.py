@@ -107,7 +107,7 @@ class MessageTransport(TcpTransport):
 
     async def connect(self, uri: ParseResult, buffer_size: int, connect_timeout: int) -> None:
         """Connects anew, after the end of the connection before."""
-        # A connection that was refused, such as for its credentials: nats-py would forget it open.
+        # nats-py does not close a connection that the server refused, as for bad credentials.
         self.close()
         self._buffer.clear()
         self._head = None
@@ -178,14 +178,14 @@ class MessageTransport(TcpTransport):
         if self._channel is not None:
             data = self._channel.encrypted(data)
         elif self._requires_tls:
-            return  # At its end, nats-py sends what waits, also to a server that was refused.
+            return  # nats-py flushes its buffer when it closes, even to a refused server.
         super().write(data)  # type: ignore[no-untyped-call]
 
     async def readline(self) -> bytes:
         """Returns one of the lines that begin a connection."""
         line = await self._line()
         if line.startswith(PONG):
-            self._answer()
+            self._note_pong()
         elif line.startswith(b"INFO"):
             info = _decoded(line.removeprefix(b"INFO"))
             if self._requires_tls:
@@ -263,7 +263,7 @@ class MessageTransport(TcpTransport):
         elif word == b"PING":
             return PING
         elif word == b"PONG":
-            return b"" if self._answer() else PONG
+            return b"" if self._note_pong() else PONG
         elif word == b"INFO":
             return _info_line(_decoded(rest))
         elif word == b"-ERR":
@@ -272,8 +272,8 @@ class MessageTransport(TcpTransport):
             raise ProtocolError("nats: unknown protocol")
         return b""
 
-    def _answer(self) -> bool:
-        """Notes the answer to the oldest ping. Returns whether the client knows nothing of it."""
+    def _note_pong(self) -> bool:
+        """Notes the PONG for the oldest ping. Returns whether to hide it from nats-py."""
         if not self._pings:
             return False
         self.answered, hidden = self._pings.popleft()
@@ -328,7 +328,7 @@ def _error_text(rest: bytes) -> bytes:
 
 @dataclass
 class Received(Msg):
-    """A message, with times of `now`."""
+    """A message, with times from `runtime.standstill.now`."""
 
     sent_after: float = -math.inf
     """When the last ping was sent that the server has answered before it sent the message."""
@@ -346,8 +346,8 @@ class SafeClient(Client):
         self.msg_class = self._with_age  # type: ignore[assignment]
 
     @property
-    def is_left(self) -> bool:
-        """Whether the task of nats-py has failed that makes the connection again."""
+    def has_stopped_reconnecting(self) -> bool:
+        """Whether nats-py's reconnect task has ended without a connection."""
         task = self._reconnection_task
         return self.is_reconnecting and task is not None and task.done()
 
@@ -363,13 +363,16 @@ class SafeClient(Client):
         for each in subscriptions:
             await each.drain()  # type: ignore[no-untyped-call]
 
-    async def prove(self, since: float) -> None:
-        """Pings the server, unless that was done after `since`."""
+    async def ping_unless_pinged(self, since: float) -> None:
+        """Pings the server, unless a ping was sent at or after `since`."""
         if self.is_connected and self.transport.pinged < since:
             self.transport.ping()
 
     def _heard(self) -> None:
-        """A server that sends is there: its answer to a ping may be behind many messages."""
+        """Resets nats-py's count of unanswered pings.
+
+        Any data shows that the server is alive, even if its PONG is queued behind messages.
+        """
         self._pings_outstanding = 0
 
     def _with_age(self, **parts: Any) -> Received:

@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from nats.js.api import RawStreamMsg, StreamInfo
 
 SETTLED = "_settled"
-"""The key that says that a bucket has existed for `LeaseTimes.ttl_s`: leases of a lost one of the
-same name may still be used when it is made."""
+"""The key that marks a bucket as at least `LeaseTimes.ttl_s` old. Until it exists, no lease is
+taken: leases from a lost bucket of the same name may still be in use."""
 
 
 class Holding(msgspec.Struct, frozen=True, kw_only=True):
@@ -84,7 +84,7 @@ def entry(revision: int, headers: dict[str, str] | None, value: bytes, now: floa
         return Entry(revision, None, now)
 
 
-ANSWER_TIMEOUT_S = 0.9
+REQUEST_TIMEOUT_S = 0.9
 """Seconds to wait for an answer of JetStream that is not about a lease."""
 
 OPEN_TIMEOUT_S = 5.0
@@ -151,15 +151,15 @@ class KeyBucket:
     """Keys over one connection. Every change names the revision that it replaces."""
 
     def __init__(
-        self, client: Client, name: str, timeout_s: float, answer_timeout_s: float
+        self, client: Client, name: str, request_timeout_s: float, key_timeout_s: float
     ) -> None:
-        """`answer_timeout_s` is the time for the answer about a key, `timeout_s` for all others."""
+        """`key_timeout_s` applies to requests about one key, `request_timeout_s` to all others."""
         self.name = name
         self.client = client
-        self._timeout_s = timeout_s
+        self._request_timeout_s = request_timeout_s
         self._stream = f"KV_{name}"
-        self._pre = f"$KV.{name}."
-        self._answer_timeout_s = answer_timeout_s
+        self._subject_prefix = f"$KV.{name}."
+        self._key_timeout_s = key_timeout_s
         self._opening = asyncio.Lock()
         self._inbox: str | None = None
         self._numbers = itertools.count()
@@ -168,20 +168,21 @@ class KeyBucket:
 
     async def info(self) -> StreamInfo:
         """Returns what the server says of the bucket. Raises the errors of nats-py."""
-        return await self.client.jetstream(timeout=self._timeout_s).stream_info(self._stream)
+        jetstream = self.client.jetstream(timeout=self._request_timeout_s)
+        return await jetstream.stream_info(self._stream)
 
     async def make(
         self, replicas: int, after: int, timeout_s: float | None = None, **settings: Any
     ) -> StreamInfo:
         """Returns `info`; makes the bucket, if there is none, with revisions after that one."""
-        jetstream = self.client.jetstream(timeout=timeout_s or self._timeout_s)
+        jetstream = self.client.jetstream(timeout=timeout_s or self._request_timeout_s)
         try:
-            # Its time is short, because it is not answered later if there was no leader.
+            # The short timeout: a request made while the stream has no leader is never answered.
             return await self.info()
         except NotFoundError:
             config = StreamConfig(
                 name=self._stream,
-                subjects=[f"{self._pre}>"],
+                subjects=[f"{self._subject_prefix}>"],
                 max_msgs_per_subject=1,
                 storage=StorageType.FILE,
                 deny_delete=True,
@@ -199,7 +200,7 @@ class KeyBucket:
         Raises `Outdated` and the errors of nats-py.
         """
         expected = {"Nats-Expected-Last-Subject-Sequence": str(revision)}
-        answer = await self._answer(f"{self._pre}{key}", value, headers | expected)
+        answer = await self._request(f"{self._subject_prefix}{key}", value, headers | expected)
         if (answer.headers or {}).get("Status") == "503":
             raise NoStreamResponseError
         ack = msgspec.json.decode(answer.data, type=_Ack)
@@ -210,7 +211,7 @@ class KeyBucket:
         APIError.from_error(ack.error)  # Raises the error of that code.
         raise AssertionError("it was raised")
 
-    async def _answer(self, subject: str, value: bytes, headers: dict[str, str]) -> Msg:
+    async def _request(self, subject: str, value: bytes, headers: dict[str, str]) -> Msg:
         """Publishes a message, and waits for its answer.
 
         This is what `request` of nats-py does, for a fifth of its cost: a node renews hundreds of
@@ -227,7 +228,7 @@ class KeyBucket:
         try:
             reply = f"{self._inbox}.{number}"
             await self.client.publish(subject, value, reply=reply, headers=headers)
-            async with asyncio.timeout(self._answer_timeout_s):
+            async with asyncio.timeout(self._key_timeout_s):
                 return await answered
         except TimeoutError:
             raise NoAnswer from None
@@ -241,16 +242,16 @@ class KeyBucket:
 
     async def last(self, key: str) -> RawStreamMsg | None:
         """Reads a key; `None` if it has no value. Raises the errors of nats-py."""
-        jetstream = self.client.jetstream(timeout=self._answer_timeout_s)
+        jetstream = self.client.jetstream(timeout=self._key_timeout_s)
         try:
-            return await jetstream.get_last_msg(self._stream, f"{self._pre}{key}")
+            return await jetstream.get_last_msg(self._stream, f"{self._subject_prefix}{key}")
         except NotFoundError:
             return None
 
     async def newer(self, key: str, revision: int) -> RawStreamMsg | None:
         """Reads a key; `None` if it has no later revision. Raises the errors of nats-py."""
-        jetstream = self.client.jetstream(timeout=self._answer_timeout_s)
-        subject = f"{self._pre}{key}"
+        jetstream = self.client.jetstream(timeout=self._key_timeout_s)
+        subject = f"{self._subject_prefix}{key}"
         try:
             return await jetstream.get_msg(self._stream, revision + 1, subject, next=True)
         except NotFoundError as error:
@@ -262,18 +263,18 @@ class KeyBucket:
         self,
         keys: str,
         take: Callable[[str, Msg], None],
-        read: Callable[[], None],
+        caught_up: Callable[[], None],
         **settings: Any,
     ) -> None:
         """Passes on all keys, and then their changes, until `unfollow`.
 
-        Calls `read` after all keys. Raises the errors of nats-py.
+        Calls `caught_up` once all present keys were passed on. Raises the errors of nats-py.
         """
 
         async def taken(message: Msg) -> None:
-            take(message.subject.removeprefix(self._pre), message)
+            take(message.subject.removeprefix(self._subject_prefix), message)
             if not message.metadata.num_pending:
-                read()
+                caught_up()
 
         config = ConsumerConfig(
             deliver_policy=DeliverPolicy.LAST_PER_SUBJECT,
@@ -282,9 +283,9 @@ class KeyBucket:
             inactive_threshold=30.0,
             **settings,
         )
-        jetstream = self.client.jetstream(timeout=self._timeout_s)
+        jetstream = self.client.jetstream(timeout=self._request_timeout_s)
         following = self.following = await jetstream.subscribe(
-            f"{self._pre}{keys}", stream=self._stream, config=config, cb=taken
+            f"{self._subject_prefix}{keys}", stream=self._stream, config=config, cb=taken
         )
         try:
             info = await following.consumer_info()
@@ -294,7 +295,8 @@ class KeyBucket:
                 await self.unfollow()
             raise
         if not info.num_pending and not (info.delivered and info.delivered.consumer_seq):
-            read()
+            # The bucket is empty: no message will report `num_pending` 0.
+            caught_up()
 
     async def unfollow(self) -> None:
         """Ends `follow_keys`."""
@@ -307,7 +309,7 @@ class LeaseBucket(KeyBucket):
     """A bucket of leases."""
 
     def __init__(self, client: Client, name: str, times: LeaseTimes = LEASE_TIMES) -> None:
-        super().__init__(client, name, ANSWER_TIMEOUT_S, times.answer_timeout_s)
+        super().__init__(client, name, REQUEST_TIMEOUT_S, times.answer_timeout_s)
         self._times = times
 
     async def open(self, replicas: int = 1, after: int = 0) -> tuple[datetime | None, int]:
@@ -334,7 +336,7 @@ class LeaseBucket(KeyBucket):
         return info.created, info.state.last_seq
 
     async def settle(self) -> Entry:
-        """Marks the bucket as one that is older than all leases of a former one.
+        """Marks the bucket as old enough for leases to be taken, see `SETTLED`.
 
         Raises as `put` does.
         """
@@ -350,9 +352,10 @@ class LeaseBucket(KeyBucket):
         return await self.publish(key, value, revision, ttl)
 
     async def delete(self, key: str, revision: int, *, is_clean: bool = True) -> None:
-        """Deletes a key, so that others take it at once. Raises as `put` does.
+        """Deletes a key. Raises as `put` does.
 
-        `is_clean` says that nothing of any holder can be on its way: the next one does not wait.
+        With `is_clean`, nothing that this or an earlier holder has sent can still be in flight: the
+        next holder may use the lease at once. Otherwise it waits first.
         """
         operation = "DEL" if is_clean else "PURGE"
         headers = {"KV-Operation": operation, "Nats-TTL": f"{MARKER_TTL_S:.0f}s"}
@@ -365,11 +368,13 @@ class LeaseBucket(KeyBucket):
             return None
         return entry(found.seq or 0, found.headers, found.data or b"", time.monotonic())
 
-    async def follow(self, take: Callable[[str, Entry], None], read: Callable[[], None]) -> None:
+    async def follow(
+        self, take: Callable[[str, Entry], None], caught_up: Callable[[], None]
+    ) -> None:
         """Passes on all keys, and then their changes, see `follow_keys`."""
 
         def taken(key: str, message: Msg) -> None:
             revision, now = message.metadata.sequence.stream, time.monotonic()
             take(key, entry(revision, message.headers, message.data, now))
 
-        await self.follow_keys(">", taken, read, num_replicas=1)
+        await self.follow_keys(">", taken, caught_up, num_replicas=1)

@@ -16,6 +16,7 @@ from holdfast.events import log_lines
 from holdfast.net.nats.connection import nats_reason
 from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import STOPPING, Moved, Refused
+from holdfast.scanner.fleet.partition_leases import PARTITION
 from holdfast.scanner.reports.variables import joined
 
 if TYPE_CHECKING:
@@ -124,7 +125,7 @@ class OtherNodes:
         self, owner: Holding, device: ScannedDevice, tag: str, text: str, left: float
     ) -> str | None:
         """Returns why another node did not carry out a command. Raises `Refused` if it tried."""
-        holding = self._fleet.leases.seen.get(f"partition.{device.partition}")
+        holding = self._fleet.leases.seen.get(f"{PARTITION}{device.partition}")
         command = Command(
             device=device.id,
             tag=tag,

@@ -38,17 +38,17 @@ class FleetUnavailable(Exception):
 
 
 @dataclass(frozen=True)
-class Seen:
+class FleetSnapshot:
     """A fleet at one moment."""
 
     fleet: str
     nodes: dict[str, Holding]
     partitions: dict[str, str]
     """The node of each partition that has one."""
-    total: int
+    partition_count: int
 
-    def shown(self, before: Seen, seconds: float) -> dict[str, Any]:
-        """What programs are shown; rates since an earlier look."""
+    def to_json(self, before: FleetSnapshot, seconds: float) -> dict[str, Any]:
+        """The fleet for JSON, with the rates since `before`, `seconds` earlier."""
         nodes = []
         for name, holding in sorted(self.nodes.items()):
             about = holding.about
@@ -71,8 +71,8 @@ class Seen:
             )
         return {
             "fleet": self.fleet,
-            "partitions": self.total,
-            "free_partitions": self.total - len(self.partitions),
+            "partitions": self.partition_count,
+            "free_partitions": self.partition_count - len(self.partitions),
             "nodes": nodes,
         }
 
@@ -123,7 +123,7 @@ class FleetObserver:
         if before is None or entry.revision > before.revision:
             self._seen[key] = entry
 
-    async def look(self) -> Seen:
+    async def look(self) -> FleetSnapshot:
         """Returns what is known now. Raises `FleetUnavailable`."""
         if not self._client.is_connected:
             where = f"NATS at {self._servers.shown}"
@@ -136,7 +136,7 @@ class FleetObserver:
         }
         nodes = {key.removeprefix(NODE): each for key, each in live.items() if key.startswith(NODE)}
         totals = [each.about.get("total", 0) for each in nodes.values()]
-        return Seen(
+        return FleetSnapshot(
             self._fleet,
             nodes,
             {key: each.node for key, each in live.items() if key.startswith(PARTITION)},
