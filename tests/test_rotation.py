@@ -57,14 +57,14 @@ def test_after_a_failure_the_file_grows_for_some_time(
     monkeypatch.setattr("time.monotonic", lambda: now)
     allow = not_renamed(monkeypatch, file)
     rotated = Rotation(file, 2, lambda: None)
-    assert rotated.is_due
+    assert rotated.may_rotate
     rotated.rotate()
-    assert not rotated.is_due
+    assert not rotated.may_rotate
     now += rotation.RETRY_S
-    assert rotated.is_due
+    assert rotated.may_rotate
     allow()
     rotated.rotate()
-    assert rotated.is_due
+    assert rotated.may_rotate
 
 
 @pytest.mark.parametrize("steps", range(4))

@@ -272,7 +272,7 @@ def test_a_node_that_keeps_its_memory_does_not_go_back_with_its_servers(
     monkeypatch.setattr(_core, "Log", functools.partial(_core.Log, cut_off=0))
     with pytest.raises(LogNotJoined, match="the servers have lost messages") as raised:
         Appliance(settings).start()
-    assert raised.value.is_settings, "another start changes nothing"
+    assert raised.value.is_permanent, "another start changes nothing"
     found = re.search(
         r"logs\.site: the stream ends at sequence (\d+) \(\S+Z\), but this node has applied "
         r"sequence (\d+) \(\S+Z\)",
@@ -381,7 +381,7 @@ def test_other_areas_are_refused_and_named(
     node("a")
     with pytest.raises(LogNotJoined, match=r"logs\.site: .*holding_registers") as caught:
         Appliance(config(tmp_path, [server.url], "b", holding_registers=99)).start()
-    assert caught.value.is_settings
+    assert caught.value.is_permanent
     result = invoke("run", str(tmp_path / "b.yaml"))
     assert result.exit_code == 2
     # The log is written by a thread of its own, before or after this line.

@@ -16,21 +16,21 @@ RETRY_S = 10.0
 
 
 class Rotation:
-    """A file, and up to `keep` older ones. While it can't be renamed, all stay.
+    """A file, and up to `keep` older ones. If renaming fails, no file is lost.
 
-    It is FILE.0 until the others have made room. What a crash leaves there is put aside later.
+    A file is renamed to FILE.0 first, then to FILE.1. `take_up` finishes what a crash interrupted.
     """
 
     def __init__(self, file: Path, keep: int, failed: Callable[[], object]) -> None:
-        """Calls `failed` in the handler of the first failure of several in a row."""
+        """`failed` is called inside the `except` block, for the first of consecutive failures."""
         self._file, self._keep, self._failed = file, keep, failed
         self._spare = self.numbered(0)
         self._is_failing = False
         self._again_at = -math.inf
 
     @property
-    def is_due(self) -> bool:
-        """Whether a full file should be put aside: the last failure was not just now."""
+    def may_rotate(self) -> bool:
+        """Whether a rotation may be tried: false for `RETRY_S` after a failure."""
         return time.monotonic() >= self._again_at
 
     def numbered(self, number: int) -> Path:

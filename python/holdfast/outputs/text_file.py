@@ -74,7 +74,7 @@ class TextFile(Receiver):
             self._open = self._file.open("ab", buffering=0)
             _cut_line(self._open, self._file)
         size = self._open.seek(0, os.SEEK_END)
-        if size and size + more > self._max_bytes and self._rotation.is_due:
+        if size and size + more > self._max_bytes and self._rotation.may_rotate:
             self.close()
             self._rotation.rotate()
             self._open = self._file.open("ab", buffering=0)

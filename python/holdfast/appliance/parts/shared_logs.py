@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from holdfast.types import LogStatus
 
 JOIN_TIMEOUT_S = 30.0
-"""The time in which a node must have caught up with its log.
+"""Seconds in which a node must catch up with its log.
 
-At most `MAX_CUT_OFF` of `server_lag.rs`: servers that know less than this node may be cut off for
-that long, so a start that ends before can be tried again.
+At most `MAX_CUT_OFF` of `server_lag.rs`: the start must time out, and be retried, before servers
+that lag behind this node count as having lost messages.
 """
 
 EVENTS = {
@@ -45,11 +45,11 @@ EVENTS = {
 
 
 class LogNotJoined(OSError):
-    """A log can't be used. With `is_settings`, starting again does not help."""
+    """A log can't be used. With `is_permanent`, a restart does not help."""
 
-    def __init__(self, message: str, *, is_settings: bool) -> None:
+    def __init__(self, message: str, *, is_permanent: bool) -> None:
         super().__init__(message)
-        self.is_settings = is_settings
+        self.is_permanent = is_permanent
 
 
 class SharedLogs(Part):
@@ -89,9 +89,9 @@ class SharedLogs(Part):
         try:
             server.start()
         except OSError as error:
-            is_settings = not isinstance(error, TemporarilyUnusable)
+            is_permanent = not isinstance(error, TemporarilyUnusable)
             text = f"logs.{name}.embedded: {error}"
-            raise LogNotJoined(text, is_settings=is_settings) from None
+            raise LogNotJoined(text, is_permanent=is_permanent) from None
 
     def _join(
         self, name: str, settings: SharedLogConfig, members: list[tuple[str, _core.Memory]]
@@ -120,10 +120,10 @@ class SharedLogs(Part):
             log_lines.write(logging.INFO, "log_joining", log=name, node=settings.node)
             log.start(JOIN_TIMEOUT_S)
         except _core.LogError as error:
-            is_settings = error.kind in ("layout", "version", "snapshot", "name_taken", "replaced")
-            raise LogNotJoined(f"logs.{name}: {error}", is_settings=is_settings) from None
+            is_permanent = error.kind in ("layout", "version", "snapshot", "name_taken", "replaced")
+            raise LogNotJoined(f"logs.{name}: {error}", is_permanent=is_permanent) from None
         except ValueError as error:
-            raise LogNotJoined(f"logs.{name}: {error}", is_settings=True) from None
+            raise LogNotJoined(f"logs.{name}: {error}", is_permanent=True) from None
         log_lines.write(
             logging.INFO,
             "log_joined",

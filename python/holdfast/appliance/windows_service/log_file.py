@@ -54,7 +54,7 @@ class _Handler(RotatingFileHandler):
 
     def shouldRollover(self, record: logging.LogRecord) -> bool:
         """Whether the file is full, and can probably be renamed."""
-        return self._rotation.is_due and bool(super().shouldRollover(record))
+        return self._rotation.may_rotate and bool(super().shouldRollover(record))
 
     def doRollover(self) -> None:
         """Begins a new file, unless a reader has this one open: the default deletes older ones."""

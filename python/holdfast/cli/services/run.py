@@ -122,7 +122,7 @@ def serve(
     except UnusableMemoryFile as error:
         fail(error, ExitCode.WRONG)
     except LogNotJoined as error:
-        fail(error, ExitCode.WRONG if error.is_settings else ExitCode.FAILED)
+        fail(error, ExitCode.WRONG if error.is_permanent else ExitCode.FAILED)
     except Unreadable as error:
         fail(error)
     except OSError as error:

@@ -82,7 +82,7 @@ class AuditFile:
         while lines:
             count = self._fitting(lines)
             is_full = count == 0 or (together and count < len(lines))
-            if self._size and is_full and self._rotation.is_due:
+            if self._size and is_full and self._rotation.may_rotate:
                 self.rotate()
                 count = self._fitting(lines)
             count = len(lines) if together else max(count, 1)
