@@ -139,7 +139,8 @@ def narrowed(
 ) -> tuple[Codes | None, Codes | None]:
     """The allowed and the denied functions of a unit, with those of its rule.
 
-    One of the two is `None`.
+    At least one of the two is `None`. `own` replaces `functions`, of which a valid configuration
+    has a subset there.
     """
     denied = tuple(dict.fromkeys((*(deny or ()), *(own_deny or ()))))
     allowed = functions if own is None else own

@@ -20,7 +20,7 @@ UNIT_SCHEMA = integer(0, MAX_UNIT)
 BIT: Schema = {"enum": [False, True, 0, 1]}
 TYPED_SCHEMA: Schema = {"type": ["integer", "number", "string", "boolean"]}
 """A value of the type that `datatype` names."""
-TEXT: Schema = {"type": "string", "minLength": 1, "maxLength": 32}
+TYPE_NAME_SCHEMA: Schema = {"type": "string", "minLength": 1, "maxLength": 32}
 ORDER: Schema = {"type": "string", "pattern": "^([A-D]{4}|[A-H]{8})$"}
 
 
@@ -59,7 +59,7 @@ SERVER_NAME = Field(
 ADDRESS = Field("address", ADDRESS_SCHEMA, "The first address, from 0", example=0)
 DATATYPE = Field(
     "datatype",
-    TEXT,
+    TYPE_NAME_SCHEMA,
     "Type of the values: `int16`, `uint32`, `float32`, `bcd16`, `bit:3`, `string:20`, `bytes:4`, "
     "`bool`, or an array such as `float32[10]`",
     None,

@@ -20,7 +20,7 @@ FALSE = b"\0\0"
 class Bool(Kind):
     """`bool`: a bit of a bit area, or a register that is not 0. Its order has no effect."""
 
-    item = "H"
+    struct_format = "H"
     finish = bool
 
     def unpack_one(self, data: bytes) -> bool:
@@ -42,7 +42,7 @@ class Bit(Kind):
     A packed bit is a mask for its register: OR it if the bit is true, AND it if false.
     """
 
-    item = "H"
+    struct_format = "H"
 
     def __init__(self, type: Type, order: Order) -> None:
         super().__init__(type, order)

@@ -100,10 +100,10 @@ class Codec:
         self.to_bytes = block.pack
         """Converts registers in any form to bytes; swaps the bytes of each if `swapped`."""
         self._to_registers = block.unpack
-        self.unpack = kind.unpack_one if type.count is None else kind.unpack_many
-        """Converts those bytes to the value."""
         single = type.count is None
-        self.item = kind.item if single else f"{2 * type.registers}s"
+        self.unpack = kind.unpack_one if single else kind.unpack_many
+        """Converts those bytes to the value."""
+        self.struct_format = kind.struct_format if single else f"{2 * type.registers}s"
         """The format of the field for `struct`, in the byte order `kind.mark`."""
         self.finish = kind.finish if single else kind.unpack_many
         """Converts the result of `struct` to the value; `None` if they are equal."""

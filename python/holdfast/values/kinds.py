@@ -20,7 +20,7 @@ class Kind(ABC):
     which the conversion between registers and bytes handles.
     """
 
-    item: str
+    struct_format: str
     """The format of an element for `struct`, in the byte order `mark`."""
     finish: Callable[[Any], Any] | None = None
     """Converts the result of `struct` to the value; `None` if they are equal."""
@@ -71,5 +71,5 @@ class Bytewise(Kind):
 
     def __init__(self, type: Type, order: Order) -> None:
         super().__init__(type, order)
-        self.item = f"{self.width}s"
+        self.struct_format = f"{self.width}s"
         self.finish = self.unpack_one

@@ -237,9 +237,9 @@ class _Pass:
         """The index of a field at byte `start` in the result, `None` if this call can't read it."""
         if codec.swapped is not self.swapped or codec.kind.mark != self._mark:
             return None
-        key = start, codec.item
+        key = start, codec.struct_format
         if start >= self._end:
-            self._form += f"{start - self._end}x{codec.item}"
+            self._form += f"{start - self._end}x{codec.struct_format}"
             self._end = start + 2 * codec.type.registers
             self._places[key] = len(self._places)
         return self._places.get(key)

@@ -48,9 +48,9 @@ class Number(Kind):
     def __init__(self, type: Type, order: Order, code: str) -> None:
         super().__init__(type, order)
         self._least, self._most = limits(type.base)
-        self.item = code
+        self.struct_format = code
         if order.places:
-            self.item = f"{self.width}s"
+            self.struct_format = f"{self.width}s"
             self.finish = self.unpack_one
         self._one = struct.Struct(f"{self.mark}{code}")
         many = self.mark + code if type.count is None else f"{self.mark}{type.count}{code}"

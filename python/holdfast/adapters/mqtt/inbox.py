@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from holdfast.ingest import MemoryAccess
     from holdfast.net.mqtt.packets import Publish
 
-MAX_BYTES = 4096
-"""The largest accepted payload: more than the text of any tag has."""
+MAX_VALUE_BYTES = 4096
+"""The largest payload of a topic with plain values, in bytes: longer than the text of any tag."""
 
 
 class BadValue(Exception):
@@ -58,8 +58,8 @@ class Value:
     def command(self, payload: memoryview) -> dict[str, Any]:
         """The command that writes a payload. Raises `BadValue`."""
         try:
-            if len(payload) > MAX_BYTES:
-                raise ValueError(f"{len(payload)} bytes, allowed: {MAX_BYTES}")
+            if len(payload) > MAX_VALUE_BYTES:
+                raise ValueError(f"{len(payload)} bytes, allowed: {MAX_VALUE_BYTES}")
             text = bytes(payload).decode()
             value = value_from(self._tag, text)
             values = self._codec.encode(self._tag.raw(value, default_round=ROUNDING_OF_MESSAGES))
@@ -79,7 +79,7 @@ class Value:
 
 
 MAX_PAYLOAD_BYTES = 8 * 2**20
-"""The largest accepted payload, in bytes."""
+"""The largest payload of any message, in bytes."""
 
 MAX_LOGGED_TOPIC_CHARS = 200
 """Characters of a topic that are logged."""

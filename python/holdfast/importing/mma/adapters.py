@@ -25,8 +25,11 @@ if TYPE_CHECKING:
     from holdfast.importing.key_reader import Section
     from holdfast.types import Area
 
-SHORT = 16
-"""Secrets with fewer characters can be guessed."""
+MIN_TOKEN_CHARS = 16
+"""Shorter tokens can be guessed."""
+
+MAX_TIMEOUT_MS = 366 * 24 * 60 * 60 * 1000
+"""The longest timeout that is converted: 366 days, in milliseconds."""
 
 PASSWORD_FILE = "mqtt.password"
 CLIENT_ID = "holdfast"
@@ -180,9 +183,9 @@ class Adapters(Reader):
                 self.desk.left_out(path, "the token repeats an earlier one")
             else:
                 found[digest] = (token.at("name"), name or f"token-{len(found) + 1}")
-                if len(secret) < SHORT:
-                    message = f"the token has fewer than {SHORT} characters and can be guessed"
-                    text = f"{message}; create one with `holdfast token`"
+                if len(secret) < MIN_TOKEN_CHARS:
+                    message = f"the token has fewer than {MIN_TOKEN_CHARS} characters and can be"
+                    text = f"{message} guessed; create one with `holdfast token`"
                     self.desk.check(token.at("token"), text)
         digest = hashlib.sha256(INGEST_TOKEN.encode()).hexdigest()
         if self._keeps_ingest_token and digest not in found:
@@ -279,7 +282,7 @@ class Adapters(Reader):
         if listen is None:
             self.desk.problem_of_key(raw.at("listen"), "missing, allowed: :port or address:port")
         bind = None if listen is None else self.binds.read(raw.at("listen"), listen)
-        timeout = raw.integer("read_timeout_ms", 1, 31_622_400_000)
+        timeout = raw.integer("read_timeout_ms", 1, MAX_TIMEOUT_MS)
         raw.close({"max_packet_bytes": "a packet is as long as its count says, up to a whole area"})
         memories = self.draft.written_by_raw_ingest()
         for name in self.draft.memories:

@@ -430,7 +430,7 @@ class _HostRequest(Request):
         raise ClientDisconnected
 
     def when_gone(self, function: Callable[[], object] | None) -> None:
-        """Calls a function when the client is gone, or at once if it is; `None`: no more."""
+        """Sets the function to call when the client disconnects; `None` removes it."""
         self._when_gone = function
         if function is not None:
             self.exchange.watch_client()

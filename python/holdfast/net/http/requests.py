@@ -26,8 +26,9 @@ Headers: TypeAlias = list[tuple[bytes, bytes]]
 JSON = b"application/json"
 
 COMMANDS = "commands"
-"""The key in `Request.kept` of `Commands`, which the core then parses bodies with, and the function
-that gets its `ParsedWrites` and returns the second step. What is not parsed comes as a request."""
+"""The key in `Request.kept` of a pair: `Commands`, and a handler. The core then parses bodies that
+follow the same head, and passes them to the handler as `ParsedWrites`; the handler returns the
+second step. A body that the core does not parse arrives as a `Request`."""
 
 MAX_KINDS = 64
 """Headers of responses that are kept."""
@@ -124,8 +125,8 @@ class Request:
     who: str = "-"
     """The name of the token's owner; `-` until the token was checked."""
     kept: dict[str, Any] = field(default_factory=dict)
-    """What an application has found out about the head. Requests of a server whose heads are equal
-    have it in common, whoever sends them; a server that starts anew knows nothing."""
+    """A cache for the application. All requests to this server with an identical head share it,
+    from any client. Empty after a restart."""
     _by_name: dict[bytes, list[bytes]] | None = field(default=None, init=False, repr=False)
 
     # What a host provides.
@@ -138,10 +139,10 @@ class Request:
         raise NotImplementedError
 
     def when_gone(self, function: Callable[[], object] | None) -> None:
-        """Calls a function when the client is gone, or at once if it is; `None`: no more.
+        """Sets the function to call when the client disconnects; `None` removes it.
 
-        The body must have been read. From here on, a half-close of the client means that it is
-        gone.
+        Calls it at once if the client already has. The body must have been read. From
+        here on, a half-close of the client means that it is gone.
         """
         raise NotImplementedError
 
@@ -170,7 +171,10 @@ class Request:
         return self.whole
 
     async def body(self, most: int) -> bytes:
-        """Reads the body, at most `most` bytes. Raises `BadRequest` and `ClientDisconnected`."""
+        """Reads the body, at most `most` bytes.
+
+        Raises `BadRequest`, `BrokenBody` and `ClientDisconnected`.
+        """
         whole = self.arrived(most)
         if whole is not None:
             return whole
