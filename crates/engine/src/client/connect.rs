@@ -19,7 +19,7 @@ pub(super) fn connect(
         }
         Place::Tcp { host, port, tls: Some(tls) } => {
             let stream = TcpByteStream::connect(host, *port, deadline)?;
-            Box::new(TlsStream::agree(stream, tls, deadline)?)
+            Box::new(TlsStream::connect(stream, tls, deadline)?)
         }
         Place::Udp { host, port } | Place::RtuOverUdp { host, port } => {
             Box::new(connect_udp(host, *port, deadline)?)

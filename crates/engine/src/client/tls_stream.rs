@@ -25,39 +25,43 @@ pub(super) struct TlsStream {
     heard: bool,
     /// The error after which nothing more can be received.
     broken: Option<TlsFailure>,
-    of_process: u32,
+    /// The process that opened the connection: a forked child must not use it.
+    owner_pid: u32,
 }
 
 impl TlsStream {
     /// Performs the handshake, before the deadline.
-    pub(super) fn agree(
+    pub(super) fn connect(
         stream: TcpByteStream,
         tls: &ClientTls,
         deadline: Instant,
     ) -> Result<TlsStream, StreamError> {
         let channel = tls.channel().map_err(|error| StreamError::Tls((&error).into()))?;
         let (plain, out) = (Vec::new(), Vec::new());
-        let of_process = std::process::id();
+        let owner_pid = std::process::id();
         let mut secure =
-            TlsStream { stream, channel, plain, out, heard: false, broken: None, of_process };
-        secure.send(&[], deadline).and_then(|()| secure.shake_hands(deadline)).map_err(ended)?;
+            TlsStream { stream, channel, plain, out, heard: false, broken: None, owner_pid };
+        secure
+            .send(&[], deadline)
+            .and_then(|()| secure.finish_handshake(deadline))
+            .map_err(ended)?;
         Ok(secure)
     }
 
-    fn shake_hands(&mut self, deadline: Instant) -> Result<(), StreamError> {
+    fn finish_handshake(&mut self, deadline: Instant) -> Result<(), StreamError> {
         while self.channel.is_handshaking() {
-            self.take(deadline)?;
-            self.intact()?;
+            self.read_some(deadline)?;
+            self.check_broken()?;
         }
         Ok(())
     }
 
-    fn intact(&self) -> Result<(), StreamError> {
+    fn check_broken(&self) -> Result<(), StreamError> {
         self.broken.clone().map_or(Ok(()), |failure| Err(StreamError::Tls(failure)))
     }
 
     /// Reads what is available, without waiting. Returns `true` if the connection has ended.
-    fn look(&mut self) -> bool {
+    fn read_available(&mut self) -> bool {
         let mut chunk = [0; CHUNK_BYTES];
         for _ in 0..MAX_READS_PER_CHECK {
             match self.stream.receive_now(&mut chunk) {
@@ -70,11 +74,11 @@ impl TlsStream {
     }
 
     /// Reads what arrives before the deadline.
-    fn take(&mut self, deadline: Instant) -> Result<(), StreamError> {
+    fn read_some(&mut self, deadline: Instant) -> Result<(), StreamError> {
         let mut chunk = [0; CHUNK_BYTES];
         let len = self.stream.receive(&mut chunk, deadline)?;
         self.feed(&chunk[..len]);
-        // The channel's answer is sent even if the deadline only ended a slice of the wait.
+        // Callers wait in slices, so the deadline may be past: sending still gets one slice.
         // A TLS failure takes precedence over a failure to send its alert.
         self.flush(deadline.max(Instant::now() + SIGNAL_CHECK_INTERVAL))
             .or_else(|error| if self.broken.is_some() { Ok(()) } else { Err(error) })
@@ -87,6 +91,14 @@ impl TlsStream {
         self.heard |= !self.plain.is_empty();
     }
 
+    /// Moves received data into `buffer`. Returns how many bytes.
+    fn copy_plain(&mut self, buffer: &mut [u8]) -> usize {
+        let len = self.plain.len().min(buffer.len());
+        buffer[..len].copy_from_slice(&self.plain[..len]);
+        self.plain.drain(..len);
+        len
+    }
+
     fn flush(&mut self, deadline: Instant) -> Result<(), StreamError> {
         if self.out.is_empty() {
             return Ok(());
@@ -96,16 +108,11 @@ impl TlsStream {
         sent
     }
 
-    /// Interprets the end of the connection: a peer may refuse a certificate without an alert.
+    /// Interprets a reset before any data: in TLS 1.3, the peer checks our certificate after our
+    /// handshake, and may close without an alert.
     fn closed_before_reply(&self, error: StreamError) -> StreamError {
         match error {
-            StreamError::Io(error)
-                if !self.heard
-                    && matches!(
-                        error.kind(),
-                        ErrorKind::ConnectionReset | ErrorKind::BrokenPipe
-                    ) =>
-            {
+            StreamError::Io(error) if !self.heard && is_reset(&error) => {
                 StreamError::Tls(TlsFailure::ClosedBeforeReply)
             }
             other => other,
@@ -117,37 +124,34 @@ impl TlsStream {
 fn ended(error: StreamError) -> StreamError {
     match error {
         StreamError::Ended => StreamError::Tls(TlsFailure::ClosedDuringHandshake),
-        StreamError::Io(error)
-            if matches!(error.kind(), ErrorKind::ConnectionReset | ErrorKind::BrokenPipe) =>
-        {
+        StreamError::Io(error) if is_reset(&error) => {
             StreamError::Tls(TlsFailure::ClosedDuringHandshake)
         }
         other => other,
     }
 }
 
+fn is_reset(error: &std::io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::ConnectionReset | ErrorKind::BrokenPipe)
+}
+
 impl ByteStream for TlsStream {
     fn receive(&mut self, buffer: &mut [u8], deadline: Instant) -> Result<usize, StreamError> {
         while self.plain.is_empty() {
-            self.intact()?;
+            self.check_broken()?;
             if self.channel.has_ended() {
                 return Err(StreamError::Ended);
             }
-            self.take(deadline).map_err(|error| self.closed_before_reply(error))?;
+            self.read_some(deadline).map_err(|error| self.closed_before_reply(error))?;
         }
-        let len = self.plain.len().min(buffer.len());
-        buffer[..len].copy_from_slice(&self.plain[..len]);
-        self.plain.drain(..len);
-        Ok(len)
+        Ok(self.copy_plain(buffer))
     }
 
     fn receive_now(&mut self, buffer: &mut [u8]) -> Result<Option<usize>, StreamError> {
-        if self.plain.is_empty() && self.look() && self.plain.is_empty() {
+        if self.plain.is_empty() && self.read_available() && self.plain.is_empty() {
             return Err(StreamError::Ended);
         }
-        let len = self.plain.len().min(buffer.len());
-        buffer[..len].copy_from_slice(&self.plain[..len]);
-        self.plain.drain(..len);
+        let len = self.copy_plain(buffer);
         Ok((len > 0).then_some(len))
     }
 
@@ -155,13 +159,13 @@ impl ByteStream for TlsStream {
         self.channel.send(bytes, &mut self.out);
         self.flush(deadline).map_err(|error| {
             // A peer that has closed the connection may have sent an alert.
-            self.look();
+            self.read_available();
             self.broken.clone().map_or(self.closed_before_reply(error), StreamError::Tls)
         })
     }
 
     fn has_ended(&mut self) -> bool {
-        let ended = self.look();
+        let ended = self.read_available();
         ended || self.broken.is_some() || self.channel.has_ended()
     }
 
@@ -173,7 +177,7 @@ impl ByteStream for TlsStream {
 impl Drop for TlsStream {
     fn drop(&mut self) {
         // In a forked child, nothing is said to the peer: the connection is that of the parent.
-        if self.of_process != std::process::id() {
+        if self.owner_pid != std::process::id() {
             return;
         }
         self.channel.end(&mut self.out);

@@ -1,5 +1,5 @@
 //! What a client asks for in its ClientHello, where rustls does not answer as clients need it: the
-//! longest fragment (RFC 6066, 4) and the protocol inside TLS (RFC 7301).
+//! maximum fragment length (RFC 6066, 4) and the application protocol (ALPN, RFC 7301).
 //!
 //! * rustls neither reads nor answers the length. Without an answer, a client must not rely on it.
 //!   But a client with little memory can read everything that it gets, if the server keeps to it.
@@ -16,7 +16,7 @@ const FIXED_LEN: usize = 2 + 32;
 
 /// The types of the extensions.
 const MAX_FRAGMENT_LENGTH: u16 = 1;
-const PROTOCOLS: u16 = 16;
+const ALPN: u16 = 16;
 
 /// The most bytes that are searched. Clients with little memory send less.
 const MAX_LEN: usize = 4 * 1024;
@@ -45,7 +45,7 @@ impl Hello {
 
     /// Whether the client offers protocols, but not this one.
     pub(super) fn offers_others_than(&self, protocol: &[u8]) -> bool {
-        let offered = self.extension(PROTOCOLS).and_then(long);
+        let offered = self.extension(ALPN).and_then(long);
         offered.is_some_and(|(mut offered, _)| {
             while let Some((name, rest)) = short(offered) {
                 if name == protocol {
