@@ -204,7 +204,7 @@ impl Line {
     /// Announces the end of the connection, without waiting.
     pub(super) fn announce_end(&mut self) {
         self.stream.end(&mut self.unsent);
-        let _ = stream::write(self.stream.socket(), &mut self.unsent);
+        let _ = stream::flush_now(self.stream.socket(), &mut self.unsent);
     }
 
     pub(super) fn into_stream(self) -> Box<dyn Stream> {

@@ -120,7 +120,7 @@ impl Results {
 
     /// Ends the current or the next wait of the receiver, without results.
     pub fn wake(&self) {
-        // The end wakes it too.
+        // Not with `put`: that must not be called after the end.
         let mut batch = lock(&self.queue);
         batch.woken = true;
         drop(batch);

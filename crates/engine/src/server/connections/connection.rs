@@ -168,7 +168,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
                     // After replies that were cut off, a closing message would be misread.
                     if self.unsent.is_empty() {
                         self.stream.end(&mut self.unsent);
-                        let _ = stream::write(self.stream.socket(), &mut self.unsent);
+                        let _ = stream::flush_now(self.stream.socket(), &mut self.unsent);
                     }
                 }
                 None => {
@@ -382,13 +382,13 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
         }
         while self.answering.is_waiting() {
             let step = poll_fn(|context| self.poll_deferred(context)).await;
-            let sent = stream::write(self.stream.socket(), &mut self.unsent);
+            let sent = stream::flush_now(self.stream.socket(), &mut self.unsent);
             if step.is_err() || sent.is_err() {
                 return;
             }
         }
         self.stream.end(&mut self.unsent);
-        let _ = stream::write(self.stream.socket(), &mut self.unsent);
+        let _ = stream::flush_now(self.stream.socket(), &mut self.unsent);
     }
 }
 
@@ -587,7 +587,7 @@ impl<F: Framing> Answering<F> {
 
     /// Sends `unsent`, then reads, answers and sends until no input is left, without waiting.
     fn drain(&mut self, stream: &mut impl Stream, unsent: &mut Vec<u8>) -> io::Result<()> {
-        stream::write(stream.socket(), unsent)?;
+        stream::flush_now(stream.socket(), unsent)?;
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             for _ in 0..MAX_LAST_READS {
                 // The replies of devices come first.
@@ -601,7 +601,7 @@ impl<F: Framing> Answering<F> {
                 if !output.is_empty() && stream.send(output, unsent).is_err() {
                     break;
                 }
-                stream::write(stream.socket(), unsent)?;
+                stream::flush_now(stream.socket(), unsent)?;
                 if answered.broken {
                     break;
                 }

@@ -198,7 +198,7 @@ impl ListenerContext {
         };
         let len = unit_server.answer(rights, unit_id, request, ask, reply);
         let answered = &reply[..len.unwrap_or_default()];
-        let refused = RefusedRequest::by(rights, unit_id, request, answered);
+        let refused = RefusedRequest::from_reply(rights, unit_id, request, answered);
         if let Some(auditor) = &self.auditor {
             auditor.note(&self.name, peer, unit_id, (request, answered), permit);
         }
@@ -215,7 +215,7 @@ impl ListenerContext {
         peer: Option<&Peer>,
     ) {
         if let Some(refused) = refused
-            && reported.is_first(&refused)
+            && reported.mark(&refused)
         {
             self.report(Kind::RefusedRequest(refused), peer.cloned());
         }

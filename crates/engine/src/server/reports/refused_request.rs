@@ -47,7 +47,7 @@ impl Why {
 impl RefusedRequest {
     /// The refusal that a memory's reply to a request is; `None` for any other reply.
     #[inline]
-    pub(crate) fn by(
+    pub(crate) fn from_reply(
         rights: &PeerRights,
         unit_id: u8,
         request: &[u8],
@@ -56,16 +56,17 @@ impl RefusedRequest {
         let code = ExceptionCode::from_code(exception_in(reply)?)?;
         let why = match code {
             ExceptionCode::ServerDeviceBusy if is_write(request) => Why::Sealed,
-            // With a memory, it is the device whose values the memory has that does not answer.
+            // If the unit has a memory, the mirrored device does not answer: that is no refusal.
             ExceptionCode::GatewayTargetFailedToRespond if rights.memory(unit_id).is_none() => {
                 Why::Unit
             }
-            _ => return RefusedRequest::with(unit_id, request, code),
+            _ => return RefusedRequest::from_exception(unit_id, request, code),
         };
         Some(RefusedRequest::new(unit_id, request, why))
     }
 
-    /// The refusal of a request that was not sent to its place; `None` if it was, or can't be.
+    /// The refusal of a request that was rejected before it was sent on. `None` if it was sent, or failed
+    /// for another reason, such as a full queue.
     pub(crate) fn before_sending<T>(
         place: &Elsewhere,
         unit_id: u8,
@@ -77,11 +78,11 @@ impl RefusedRequest {
             ExceptionCode::ServerDeviceBusy if place.memory().is_some_and(Memory::sealed) => {
                 Some(RefusedRequest::new(unit_id, request, Why::Sealed))
             }
-            code => RefusedRequest::with(unit_id, request, code),
+            code => RefusedRequest::from_exception(unit_id, request, code),
         }
     }
 
-    fn with(unit_id: u8, request: &[u8], code: ExceptionCode) -> Option<RefusedRequest> {
+    fn from_exception(unit_id: u8, request: &[u8], code: ExceptionCode) -> Option<RefusedRequest> {
         let why = match code {
             ExceptionCode::IllegalFunction => Why::Function,
             ExceptionCode::IllegalDataAddress => Why::Address,
@@ -101,8 +102,8 @@ impl RefusedRequest {
 pub(crate) struct Reported(AtomicU8);
 
 impl Reported {
-    /// Whether a refusal is the first for its reason.
-    pub(crate) fn is_first(&self, refused: &RefusedRequest) -> bool {
+    /// Marks the reason of a refusal as reported. Returns whether it was the first.
+    pub(crate) fn mark(&self, refused: &RefusedRequest) -> bool {
         let bit = 1 << refused.why as u8;
         self.0.fetch_or(bit, Ordering::Relaxed) & bit == 0
     }
@@ -122,7 +123,8 @@ mod tests {
     const WRITE: [u8; 5] = [6, 0, 0, 0, 1];
 
     fn why(request: &[u8], reply: &[u8]) -> Option<Why> {
-        RefusedRequest::by(&PeerRights::none(), 1, request, reply).map(|refused| refused.why)
+        RefusedRequest::from_reply(&PeerRights::none(), 1, request, reply)
+            .map(|refused| refused.why)
     }
 
     #[test]
@@ -138,7 +140,7 @@ mod tests {
             narrowed: Vec::new(),
         });
         for (unit_id, expected) in [(1, None), (2, Some(Why::Unit))] {
-            let refused = RefusedRequest::by(&rights, unit_id, &READ, &[0x83, 0x0B]);
+            let refused = RefusedRequest::from_reply(&rights, unit_id, &READ, &[0x83, 0x0B]);
             assert_eq!(refused.map(|refused| refused.why), expected);
         }
     }
@@ -181,8 +183,8 @@ mod tests {
         let reported = Reported::default();
         let refused = |why| RefusedRequest { unit_id: 1, function_code: 6, why };
         for why in [Why::Function, Why::Unit, Why::Address, Why::Sealed] {
-            assert!(reported.is_first(&refused(why)));
-            assert!(!reported.is_first(&refused(why)));
+            assert!(reported.mark(&refused(why)));
+            assert!(!reported.mark(&refused(why)));
         }
     }
 }

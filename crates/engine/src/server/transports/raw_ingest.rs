@@ -204,7 +204,7 @@ impl<S: Stream> Sending<S> {
         if self.unsent.is_empty() {
             self.stream.end(&mut self.unsent);
         }
-        let _ = stream::write(self.stream.socket(), &mut self.unsent);
+        let _ = stream::flush_now(self.stream.socket(), &mut self.unsent);
     }
 }
 
@@ -824,7 +824,7 @@ fn answer<S: Stream>(stream: &mut S, unsent: &mut Vec<u8>, ticket: &Ticket, repl
     ticket.set_answered();
     if stream.send(&[reply], unsent).is_ok() {
         stream.end(unsent);
-        let _ = stream::write(stream.socket(), unsent);
+        let _ = stream::flush_now(stream.socket(), unsent);
     }
 }
 

@@ -130,8 +130,8 @@ pub(crate) fn read(socket: &TcpStream, input: &mut [u8]) -> Option<usize> {
     (&*SockRef::from(socket)).read(input).ok().filter(|len| *len > 0)
 }
 
-/// Sends all of `unsent` without waiting, or fails.
-pub(crate) fn write(socket: &TcpStream, unsent: &mut Vec<u8>) -> io::Result<()> {
+/// Sends all of `unsent` without waiting, or fails. Clears it in both cases.
+pub(crate) fn flush_now(socket: &TcpStream, unsent: &mut Vec<u8>) -> io::Result<()> {
     let written = (&*SockRef::from(socket)).write_all(unsent);
     unsent.clear();
     written

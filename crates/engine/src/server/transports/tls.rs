@@ -88,7 +88,7 @@ impl ServerTlsStream {
     pub(crate) fn announce_end(&mut self) {
         let mut unsent = Vec::new();
         self.channel.end(&mut unsent);
-        let _ = stream::write(&self.socket, &mut unsent);
+        let _ = stream::flush_now(&self.socket, &mut unsent);
     }
 
     /// Announces the end, and closes the connection.
