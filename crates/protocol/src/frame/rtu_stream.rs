@@ -119,8 +119,9 @@ impl Requests {
     }
 
     /// When the last byte of the data of an unknown function equals the first byte of the CRC of the
-    /// bytes before it, the CRC matches one byte too early. The remaining byte is 0. But unit 0 may also
-    /// be the next one: of both frames, the one that is complete first shows it.
+    /// bytes before it, the CRC matches one byte too early. The remaining byte is 0. But the 0 may
+    /// also be the unit id of the next frame. Both readings are tried; the one whose frame is complete first
+    /// is right.
     fn after_unknown<'a>(&mut self, bytes: &'a [u8]) -> Next<'a> {
         let (here, behind) = (known(bytes), known(&bytes[1..]));
         match (here, behind) {
@@ -207,9 +208,9 @@ enum DataLen {
     Unknown,
 }
 
-/// Whether a server that takes requests from a line takes this PDU as one request. One of a function of the
-/// standard that is too long is a request and the beginning of another one for a server that knows their
-/// lengths, as most do; for functions that it does not know, a length can't be known.
+/// Whether a server on a serial line reads this PDU as exactly one request. If a PDU of a standard function
+/// is too long, the server takes the excess bytes as the start of another request. The length of other
+/// functions is unknown: returns true.
 ///
 /// ```
 /// use holdfast_protocol::frame::rtu_stream::is_one_request;

@@ -149,9 +149,9 @@ impl Objects {
             (_, from) => (from.unwrap_or(0), self.0.len()),
         };
         let asked = self.0.iter().skip(from).take(most);
-        let mut asked = asked.take_while(|(id, _)| *id <= code.last_object());
+        let asked = asked.take_while(|(id, _)| *id <= code.last_object());
         let (mut len, mut count, mut next) = (HEAD_LEN, 0, None);
-        for (id, value) in asked.by_ref() {
+        for (id, value) in asked {
             let Some(out) = pdu.get_mut(len..len + 2 + value.len()) else {
                 next = Some(*id);
                 break;

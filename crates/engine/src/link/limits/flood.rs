@@ -16,7 +16,7 @@ use crate::client::StrayCounters;
 /// Unsolicited bytes that are tolerated at once.
 const TOLERATED_BYTES: u64 = 64 * 1024;
 
-/// The time in which that many bytes no longer count.
+/// The time in which `TOLERATED_BYTES` decay.
 const DECAY_TIME: Duration = Duration::from_secs(10);
 
 /// Unsolicited bytes of a link.
@@ -24,7 +24,7 @@ const DECAY_TIME: Duration = Duration::from_secs(10);
 pub(in crate::link) struct Flood {
     counters: Arc<StrayCounters>,
     retry: Retry,
-    /// Bytes that still counted, and when that was.
+    /// The decaying byte count, and when it was last updated.
     level: Cell<(u64, Instant)>,
     /// The bytes that the counters had then.
     counted: Cell<u64>,
@@ -50,12 +50,13 @@ impl Flood {
         let (level, at) = self.level.get();
         let decayed = TOLERATED_BYTES as f64 * (now - at).div_duration_f64(DECAY_TIME);
         let level = level.saturating_sub(decayed as u64) + new;
-        // The next flood after a pause is noticed early, and the pauses between floods are bounded.
+        // Capped: the count decays within `DECAY_TIME` after any flood.
         self.level.set((level.min(TOLERATED_BYTES), now));
         if level <= TOLERATED_BYTES {
             return None;
         }
         let (floods, last) = self.floods.get();
+        // Consecutive: within twice the longest pause, and the time to decay.
         let is_again = last.is_some_and(|last| now - last <= 2 * self.retry.most + DECAY_TIME);
         let floods = if is_again { floods.saturating_add(1) } else { 1 };
         self.floods.set((floods, Some(now)));

@@ -28,8 +28,9 @@ const RETRY_AFTER: Duration = Duration::from_secs(300);
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InFlight {
     Fixed(u16),
-    /// More while round trips stay as short as those of single requests. After a timeout, one; and after
-    /// another failure with which devices refuse a second request while they carry out the first.
+    /// One at first, more while round trips stay as short as those of single requests. One again after a
+    /// timeout. One also after exception 05 or 06, a lost connection or an invalid reply while other
+    /// requests were in flight: the device may accept no second request.
     Auto,
 }
 
@@ -49,19 +50,20 @@ pub(in crate::link) struct Pace {
 #[derive(Default)]
 struct Places {
     free: Cell<usize>,
-    waiting: RefCell<Queue<oneshot::Sender<Free>>>,
+    waiting: RefCell<Queue<oneshot::Sender<PlaceGuard>>>,
     /// Places that are taken away as soon as they are given back.
     owed: Cell<usize>,
 }
 
 /// Lets a request be in flight while it lasts.
-pub(in crate::link) type Place<'p> = (Free, Option<SemaphorePermit<'p>>, RwLockReadGuard<'p, ()>);
+pub(in crate::link) type Place<'p> =
+    (PlaceGuard, Option<SemaphorePermit<'p>>, RwLockReadGuard<'p, ()>);
 
 /// While it lasts, no other request is in flight.
-pub(in crate::link) type Alone<'p> = (Free, RwLockWriteGuard<'p, ()>);
+pub(in crate::link) type Alone<'p> = (PlaceGuard, RwLockWriteGuard<'p, ()>);
 
-/// A place, which is given back when it is dropped.
-pub(in crate::link) struct Free(Option<Rc<Places>>);
+/// A taken place. Dropping it gives the place back.
+pub(in crate::link) struct PlaceGuard(Option<Rc<Places>>);
 
 /// When a request was sent, and whether it was the only one in flight.
 pub(in crate::link) struct Began {
@@ -98,20 +100,20 @@ impl Pace {
             Priority::Doubtful => Some(self.doubtful.acquire().await.expect("it is never closed")),
             _ => None,
         };
-        (self.free(source, priority).await, doubtful, self.in_flight.read().await)
+        (self.acquire(source, priority).await, doubtful, self.in_flight.read().await)
     }
 
     /// Waits for a place, and then until no other request is in flight.
     pub(in crate::link) async fn alone(&self, source: u64, priority: Priority) -> Alone<'_> {
-        (self.free(source, priority).await, self.in_flight.write().await)
+        (self.acquire(source, priority).await, self.in_flight.write().await)
     }
 
-    async fn free(&self, source: u64, priority: Priority) -> Free {
+    async fn acquire(&self, source: u64, priority: Priority) -> PlaceGuard {
         if let Some(place) = self.places.take() {
             return place;
         }
         let (sender, place) = oneshot::channel();
-        let is_awaited = |sender: &oneshot::Sender<Free>| !sender.is_closed();
+        let is_awaited = |sender: &oneshot::Sender<PlaceGuard>| !sender.is_closed();
         self.places.waiting.borrow_mut().push(source, priority, sender, is_awaited);
         place.await.expect("places outlive those who wait for one")
     }
@@ -170,17 +172,17 @@ impl Pace {
 }
 
 impl Places {
-    fn take(self: &Rc<Places>) -> Option<Free> {
+    fn take(self: &Rc<Places>) -> Option<PlaceGuard> {
         let free = self.free.get().checked_sub(1)?;
         self.free.set(free);
-        Some(Free(Some(Rc::clone(self))))
+        Some(PlaceGuard(Some(Rc::clone(self))))
     }
 
     /// Gives a place to the next request.
     fn give(self: &Rc<Places>) {
         loop {
             let Some(next) = self.waiting.borrow_mut().pop() else { break };
-            match next.send(Free(Some(Rc::clone(self)))) {
+            match next.send(PlaceGuard(Some(Rc::clone(self)))) {
                 Ok(()) => return,
                 // That request was cancelled. Its drop must not return the place a second time.
                 Err(mut place) => place.0 = None,
@@ -190,7 +192,7 @@ impl Places {
     }
 }
 
-impl Drop for Free {
+impl Drop for PlaceGuard {
     fn drop(&mut self) {
         let Some(places) = self.0.take() else { return };
         match places.owed.get().checked_sub(1) {
@@ -322,7 +324,7 @@ mod tests {
     }
 
     #[tokio::test]
-    async fn failures_take_places_only_beside_other_requests_and_are_no_round_trips() {
+    async fn failures_lower_the_limit_only_beside_other_requests() {
         let lost = Failure::Closed(Closed::ByPeer);
         let damaged = Failure::Invalid(InvalidResponse::ProtocolId(1));
         for failure in [Failure::Exception(5), Failure::Exception(6), lost, damaged] {

@@ -76,7 +76,7 @@ impl Serving {
         };
         let client_gone = reply.client_gone();
         let joining = self.reads.join(read.clone(), reply);
-        if joining.joins {
+        if joining.follows_equal {
             counters.coalesced.add();
         }
         let turn = tokio::select! {

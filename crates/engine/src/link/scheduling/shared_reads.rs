@@ -20,17 +20,17 @@ pub(in crate::link) struct SharedReads {
     coalesce: bool,
     /// How long a reply answers equal reads.
     keep: Duration,
-    waiting: RefCell<HashMap<Read, Rc<Equal>>>,
-    cached: RefCell<HashMap<Read, Cached>>,
+    waiting: RefCell<HashMap<ReadKey, Rc<EqualReads>>>,
+    cached: RefCell<HashMap<ReadKey, Cached>>,
 }
 
 /// A read that equal ones can share a reply with: its unit id and PDU.
-pub(in crate::link) type Read = (u8, Box<[u8]>);
+pub(in crate::link) type ReadKey = (u8, Box<[u8]>);
 
 /// Equal reads. Each waits for a turn of its own, so that none waits longer than without the others; the
 /// first to have it is sent for all.
 #[derive(Default)]
-struct Equal {
+struct EqualReads {
     replies: RefCell<Vec<Reply>>,
     sent: Notify,
 }
@@ -38,11 +38,12 @@ struct Equal {
 struct Cached {
     pdu: Vec<u8>,
     until: Instant,
+    /// The count of changes when the read was sent.
     changes: u64,
 }
 
 /// The key of a read whose reply can answer equal ones: functions 1 to 4.
-pub(in crate::link) fn shareable(unit_id: u8, request: &EncodedRequest) -> Option<Read> {
+pub(in crate::link) fn shareable(unit_id: u8, request: &EncodedRequest) -> Option<ReadKey> {
     let pdu = request.pdu();
     (matches!(pdu[0], 1..=4) && request.request().is_some()).then(|| (unit_id, pdu.into()))
 }
@@ -53,19 +54,19 @@ impl SharedReads {
     }
 
     /// Lets a request wait with equal reads, if it is a read.
-    pub(in crate::link) fn join(&self, read: Option<Read>, reply: Reply) -> Joining<'_> {
+    pub(in crate::link) fn join(&self, read: Option<ReadKey>, reply: Reply) -> Joining<'_> {
         let read = read.filter(|_| self.coalesce);
         let equal = match &read {
             Some(read) => Rc::clone(self.waiting.borrow_mut().entry(read.clone()).or_default()),
             None => Rc::default(),
         };
         equal.replies.borrow_mut().push(reply);
-        let joins = equal.replies.borrow().len() > 1;
-        Joining { reads: self, read, equal, joins }
+        let follows_equal = equal.replies.borrow().len() > 1;
+        Joining { reads: self, read, equal, follows_equal }
     }
 
     /// A valid reply to an equal read. `changes` counts requests that may have changed a device.
-    pub(in crate::link) fn cached(&self, read: &Read, changes: u64) -> Option<Vec<u8>> {
+    pub(in crate::link) fn cached(&self, read: &ReadKey, changes: u64) -> Option<Vec<u8>> {
         if self.keep.is_zero() {
             return None;
         }
@@ -76,7 +77,7 @@ impl SharedReads {
     }
 
     /// Keeps a reply for equal reads, until something may have changed a device since it was asked for.
-    pub(in crate::link) fn keep(&self, read: Read, pdu: &[u8], changes: u64) {
+    pub(in crate::link) fn keep(&self, read: ReadKey, pdu: &[u8], changes: u64) {
         if self.keep.is_zero() {
             return;
         }
@@ -94,10 +95,10 @@ impl SharedReads {
 /// A request that waits for its turn.
 pub(in crate::link) struct Joining<'r> {
     reads: &'r SharedReads,
-    read: Option<Read>,
-    equal: Rc<Equal>,
+    read: Option<ReadKey>,
+    equal: Rc<EqualReads>,
     /// Whether an equal read waited before it.
-    pub(in crate::link) joins: bool,
+    pub(in crate::link) follows_equal: bool,
 }
 
 impl Joining<'_> {
@@ -109,6 +110,7 @@ impl Joining<'_> {
     /// Its client has disconnected: its place in the queue is free, and equal reads wait without it.
     pub(in crate::link) fn withdraw(self) {
         self.equal.replies.borrow_mut().retain(|reply| !reply.is_unwanted());
+        // One reference is in `waiting`, the other is this one.
         let is_last = Rc::strong_count(&self.equal) == 2;
         if let Some(read) = self.read.as_ref().filter(|_| is_last) {
             self.reads.waiting.borrow_mut().remove(read);
