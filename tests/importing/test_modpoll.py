@@ -162,6 +162,15 @@ def test_lists_of_bits_become_tags_with_the_same_values(
     assert "writable" not in tags["c2_0"]
 
 
+def test_types_of_registers_take_more_bytes_of_coils_than_they_count(
+    read: Callable[[str], Imported],
+) -> None:
+    rows = "ref,a,0,bool,r\nref,b,1,int32,r\nref,c,3,bool8,r\nref,u,4,uint8,r\nref,d,6,bool,r\n"
+    found = read(f"device,plant,1\npoll,coil,0,64,BE_BE\n{rows}")
+    tags = found.data["devices"]["plant"]["tags"]
+    assert [tags[name]["address"] for name in ("a_7", "c_7", "d_7")] == [0, 40, 56]
+
+
 def test_what_the_source_did_not_read_is_left_out(read: Callable[[str], Imported]) -> None:
     found = read(
         "# plant of 2024\n"

@@ -354,13 +354,16 @@ def _bit_tags(desk: Desk, poll: _Poll) -> Iterator[tuple[KeyPath, str, dict[str,
     """The tags of a poll of coils or discrete inputs.
 
     The source takes a byte of the reply after the other: an address behind the start of the poll
-    counts bytes, and begins later if the reference before it has taken that byte.
+    counts bytes, and begins later if the reference before it has taken that byte. A type of
+    registers takes more bytes than it counts.
     """
-    at = poll.start
+    at, byte = poll.start, 0
     for each in poll.references:
-        at = max(at, each.address)
-        first = poll.start + 8 * (at - poll.start)
-        at += each.width
+        byte += max(0, each.address - at)
+        at = max(at, each.address) + each.width
+        first = poll.start + 8 * byte
+        is_known = each.type in _WIDTHS | _LISTS or each.type.startswith("string")
+        byte += (each.width if each.type in _LISTS else 2 * each.width) if is_known else 0
         if first + 8 * (each.width - 1) >= poll.end:
             desk.left_out(each.path, "the reply ended before its byte; the source had no value")
         elif each.type not in _LISTS:
