@@ -142,6 +142,9 @@ class Site:
 
     revision = answers = 0
 
+    def __init__(self) -> None:
+        self.retained: dict[tuple[str, str], str] = {}
+
     def devices(self) -> dict[str, DeviceInfo]:
         return {}
 
