@@ -1,8 +1,20 @@
-//! The destination of a read.
+//! What is read from a device, and where it goes.
 
 use std::sync::Arc;
 
 use holdfast_memory::{Area, Memory, Write};
+
+#[derive(Debug, Clone)]
+pub struct ReadSettings {
+    pub area: Area,
+    pub address: u16,
+    /// Any number. A read that does not fit into one request takes several, and is written
+    /// atomically.
+    pub count: u32,
+    pub into: Option<Destination>,
+    /// Whether the receivers of the device get it.
+    pub forward: bool,
+}
 
 /// A range of a memory.
 #[derive(Debug, Clone)]

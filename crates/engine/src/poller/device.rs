@@ -24,7 +24,7 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
 use super::cost::Samples;
-use super::destination::Destination;
+use super::destination::{Destination, ReadSettings};
 use super::forwarding::{Forward, ForwardSettings};
 use super::learned_limits::{Learned, Unreadable};
 use super::panic_guard::{Panicked, catch};
@@ -104,18 +104,6 @@ impl DeviceSettings {
             fence: None,
         }
     }
-}
-
-#[derive(Debug, Clone)]
-pub struct ReadSettings {
-    pub area: Area,
-    pub address: u16,
-    /// Any number. A read that does not fit into one request takes several, and is written
-    /// atomically.
-    pub count: u32,
-    pub into: Option<Destination>,
-    /// Whether the receivers of the device get it.
-    pub forward: bool,
 }
 
 /// A running device.

@@ -27,8 +27,8 @@ mod turn;
 mod write_through;
 
 pub use cost::UNMEASURED_COST_MS;
-pub use destination::Destination;
-pub use device::{DeviceSettings, ReadSettings};
+pub use destination::{Destination, ReadSettings};
+pub use device::DeviceSettings;
 pub use forwarding::{ForwardCounters, ForwardFailure, ForwardSettings};
 pub use mirror_age::MirrorAge;
 pub use results::{Batch, BlockResult, Poll, Results, Written};

@@ -18,7 +18,8 @@ use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
-use super::device::{Device, DeviceSettings, Inbox, Planned, ReadSettings};
+use super::destination::ReadSettings;
+use super::device::{Device, DeviceSettings, Inbox, Planned};
 use super::forwarding::{Forward, ForwardCounters, ForwardSettings};
 use super::panic_guard::spawn_guarded;
 use super::plan::{PlanError, PlanLimits};

@@ -13,7 +13,7 @@ use holdfast_memory::{Access, Area, Memory, Outcome, Refusal, Write};
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, Function, Range, Request};
 use tokio::sync::{mpsc, oneshot};
 
-use super::device::ReadSettings;
+use super::destination::ReadSettings;
 use crate::client::ClientError;
 use crate::items::{Items, touched};
 use crate::link::{
