@@ -84,7 +84,7 @@ def scada(appliance: Appliance) -> tuple[str, int]:
 
 def pauses(front: Client) -> bool:
     """Waits until the next request counts as sent after a pause. Returns whether no reply came."""
-    return not select.select([front.socket], [], [], 0.1)[0]
+    return not select.select([front.socket], [], [], 0.3)[0]
 
 
 def await_nobody(appliance: Appliance, others: int = 0) -> None:

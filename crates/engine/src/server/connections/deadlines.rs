@@ -9,8 +9,8 @@ use crate::server::reports::event::Kind;
 /// A timer without a deadline fires after this time.
 pub(crate) const NO_DEADLINE: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
 
-/// Requests that are sent together arrive within this time of each other.
-pub(crate) const BURST_TIME: Duration = Duration::from_millis(50);
+/// Requests that are sent together arrive within this time of each other, also if TCP sends a segment again.
+pub(crate) const BURST_TIME: Duration = Duration::from_millis(250);
 
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Timeouts {
@@ -93,7 +93,7 @@ impl Deadlines {
     /// Whether what arrives now was sent after a pause, not together with the last request or because of
     /// the last reply.
     pub(super) fn has_paused(&self) -> bool {
-        self.last_request.elapsed() > self.timeouts.frame.unwrap_or(BURST_TIME)
+        self.last_request.elapsed() > self.timeouts.frame.unwrap_or_default().max(BURST_TIME)
     }
 
     /// All that has arrived was complete.
