@@ -335,6 +335,26 @@ def test_options_in_the_url_of_a_connection_in_use_require_a_restart(
     assert reasons(link(before) | device(before), link(before) | device(before)) == []
 
 
+def test_another_name_of_a_serial_line_in_use_requires_a_restart(rig: Rig, tmp_path: Path) -> None:
+    line, by_id, other = (tmp_path / name for name in ("line", "by-id", "other"))
+    line.touch()
+    other.touch()
+    by_id.symlink_to(line)
+
+    def config(path: Path, kind: str = "devices") -> Config:
+        device = {"url": f"rtu://{path}", **({"interval": 1} if kind == "devices" else {})}
+        found: Config = rig.load(plant(**{kind: {"pump": device}}))
+        return found
+
+    for kind in ("devices", "links"):
+        reasons = list(restart_reasons(config(line), config(by_id, kind)))
+        assert reasons == [f"{kind}.pump: another name of a serial line in use"]
+        assert list(restart_reasons(config(line), config(other, kind))) == []
+    by_id.unlink()
+    by_id.symlink_to(other)  # The adapters have exchanged their names.
+    assert list(restart_reasons(config(by_id), config(by_id))) == []
+
+
 @pytest.mark.parametrize(
     "setting",
     [

@@ -58,6 +58,7 @@ class Devices(Part):
     def start(self) -> None:
         """Begins to poll."""
         self._begin()
+        del self._begin  # It has links that a reload may remove.
 
     def prepare(self, plan: Plan) -> Callable[[], None]:
         """Creates links, and the devices with other settings."""
