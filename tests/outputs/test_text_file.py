@@ -164,6 +164,16 @@ def test_a_line_that_a_crash_has_cut_off_is_removed(
     assert (record.message, vars(record)["fields"]) == ("output_line_cut", fields)
 
 
+@pytest.mark.parametrize("content", [b"\n\0\nSQLite", b"{}", b"time,device\n" + b"x" * (1 << 20)])
+def test_what_no_output_has_written_is_not_removed(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(content)
+    file = TextFile(settings(path, "csv"))
+    file.send(READINGS[:1])
+    file.close()
+    assert path.read_bytes().startswith(content + b"\n2")
+
+
 def test_what_a_full_disk_cuts_off_is_removed(tmp_path: Path) -> None:
     file = TextFile(settings(tmp_path / "a.jsonl", "jsonl"))
     file.send(READINGS[:1])

@@ -7,7 +7,6 @@ import io
 import logging
 import os
 from datetime import UTC, datetime
-from mmap import ACCESS_READ, mmap
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -28,6 +27,9 @@ if TYPE_CHECKING:
 
 COLUMNS = ("time", "device", "tag", "value", "unit", "error")
 
+MAX_LINE_BYTES = 1 << 20
+"""No line is longer: the last so many bytes of a file have the end of one."""
+
 
 class TextFile(Receiver):
     """A file of whole lines. What a full disk cuts off is removed, and written again later."""
@@ -38,6 +40,7 @@ class TextFile(Receiver):
         self._rotation = Rotation(settings.file, settings.keep, self._not_rotated)
         self._encode = ENCODINGS[settings.format]
         self._head = f"{','.join(COLUMNS)}\n".encode() if settings.format == "csv" else b""
+        self._begins = BEGINS[settings.format]
         self._open: io.FileIO | None = None
 
     def send(self, readings: list[Reading]) -> None:
@@ -72,7 +75,7 @@ class TextFile(Receiver):
         if self._open is None:
             self._rotation.take_up()
             self._open = self._file.open("ab", buffering=0)
-            _cut_line(self._open, self._file)
+            _end_line(self._open, self._file, self._begins)
         size = self._open.seek(0, os.SEEK_END)
         if size and size + more > self._max_bytes and self._rotation.may_rotate:
             self.close()
@@ -91,16 +94,26 @@ def _is_same(file: io.FileIO, path: Path) -> bool:
         return False
 
 
-def _cut_line(file: io.FileIO, path: Path) -> None:
-    """Removes a line that a crash has cut off: half of a value can be a wrong one."""
+def _end_line(file: io.FileIO, path: Path, begins: bytes) -> None:
+    """Removes a line that a crash has cut off: half of a value can be a wrong one.
+
+    In a file that does not begin as an output does, the line is another's: it is only ended.
+    """
     size = file.seek(0, os.SEEK_END)
     if not size:
         return
-    with path.open("rb") as reading, mmap(reading.fileno(), 0, access=ACCESS_READ) as data:
-        whole = data.rfind(b"\n") + 1
-    if whole < size:
-        file.truncate(whole)
-        log_lines.write(logging.WARNING, "output_line_cut", file=str(path), bytes=size - whole)
+    with path.open("rb") as reading:
+        is_own = reading.read(len(begins)) == begins
+        reading.seek(max(0, size - MAX_LINE_BYTES))
+        tail = reading.read()
+    cut = len(tail) - (tail.rfind(b"\n") + 1)
+    if not cut:
+        return
+    if is_own and cut < MAX_LINE_BYTES:
+        file.truncate(size - cut)
+        log_lines.write(logging.WARNING, "output_line_cut", file=str(path), bytes=cut)
+    else:
+        file.write(b"\n")
 
 
 def row(reading: Reading) -> tuple[Any, ...]:
@@ -141,3 +154,10 @@ ENCODINGS: dict[str, Callable[[list[Reading]], bytes]] = {
     "jsonl": _json_lines,
     "influx": _influx,
 }
+
+BEGINS: dict[str, bytes] = {
+    "csv": b"time,",
+    "jsonl": b'{"time":',
+    "influx": f"{MEASUREMENT},device=".encode(),
+}
+"""How a file of an output begins."""
