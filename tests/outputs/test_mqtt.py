@@ -70,7 +70,7 @@ def test_status_is_online_again_if_somebody_else_publishes_offline(
 ) -> None:
     plant.device()
     probe = plant.probe("plant/holdfast/status")
-    plant.run(version=version)
+    plant.run(version=version, writes=True)
     probe.until("plant/holdfast/status", "online")
     wire.until(lambda: plant.count("sent") >= 4, "sent")
     for _ in range(2):

@@ -116,7 +116,9 @@ class MqttOutput(BrokerReceiver):
         self._availability.begin()
         self._revision = -1
         self._entities = {}
-        session.subscribe([self._topics.status], retained=False)
+        # Some brokers end the connection of a program that may only publish.
+        if self._settings.writes or self._discovery is not None:
+            session.subscribe([self._topics.status], retained=False)
         session.publish([self._availability.of_output(ONLINE)])
         # A broker that ends each connection at once must not fill the buffer with repetitions.
         if self._connects > 1 and self._has_sent:
