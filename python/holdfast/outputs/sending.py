@@ -117,8 +117,12 @@ class Sending:
         First waits for the output before, which may still end: two would send the same readings.
         """
         while not self._buffer.in_use.acquire(timeout=CHECK_INTERVAL_S):
+            self._is_failing = True
+            self._last_error = "the output before the reload has not ended"
             if stop.is_set():
+                self._log_unsent()
                 return
+        self._is_failing, self._last_error = False, None
         try:
             self._run(stop)
         finally:
@@ -244,6 +248,10 @@ class Sending:
                     break
         self._keep(STORE_TIMEOUT_S)
         self._log_dropped(0.0)
+        self._log_unsent()
+
+    def _log_unsent(self) -> None:
+        """Logs what is lost."""
         unsent = len(self._buffer) - (self._buffer.stored.count if self._buffer.stored else 0)
         if unsent > 0:
             log_lines.write(logging.WARNING, "output_unsent", output=self._name, count=unsent)

@@ -199,8 +199,7 @@ class TagValues:
             return Stored(file, settings.max_bytes, self.find)
 
         def leaves() -> bool:
-            now = self._outputs.get(name)
-            return now is None or now.settings.buffer.file != file
+            return all(each.settings.buffer.file != file for each in self._outputs.values())
 
         return Sending(name, receiver(), output.buffer, None if file is None else opened, leaves)
 
