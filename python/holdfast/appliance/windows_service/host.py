@@ -36,6 +36,7 @@ class HostedService(ServiceFramework):
     def __init__(self, arguments: list[str]) -> None:
         super().__init__(arguments)
         self.control = ServiceControl(self.running, self.stopping)
+        self.is_stopped = False
 
     def GetAcceptedControls(self) -> int:
         """The requests of Windows that are answered."""
@@ -48,12 +49,14 @@ class HostedService(ServiceFramework):
         try:
             type(self).serve(self.control)
         except SystemExit as end:
-            if end.code:
+            # After a stop on request, an error would make Windows start the service again.
+            if end.code and not self.is_stopped:
                 raise ServiceFailed(f"exit code {end.code}: see {self.log}") from None
 
     def SvcStop(self) -> None:
         """Windows stops the service."""
         self.stopping()
+        self.is_stopped = True
         self.control.request_stop()
 
     SvcShutdown = SvcStop
