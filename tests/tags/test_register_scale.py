@@ -112,6 +112,11 @@ def test_floats_and_arrays_have_scales_too() -> None:
     assert text_of(by_name()["power"], 432.0) == "432"
 
 
+def test_states_that_a_scale_can_not_have_do_not_refuse_it() -> None:
+    tag = by_name("factor", states={1: "on", 20: "high"}, writable=True)["power"]
+    assert tag.with_scale(10).raw(20) == 2
+
+
 def test_a_value_without_the_content_of_its_scale_is_refused() -> None:
     power = by_name(min=0)["power"]
     with pytest.raises(ValueError, match=f"the scale is in {HR} 12, which has to be read first"):

@@ -187,7 +187,9 @@ class Tag(WritableTag):
     def with_scale(self, content: Any) -> Tag:
         """The tag with the scale that its register contains. Raises `ValueError` without one."""
         assert isinstance(self.scale, RegisterScale), "only such tags have a register for it"
-        return replace(self, scale=self.scale.factor(content))
+        scaled = replace(self, scale=self.scale.factor(content), states={})
+        scaled._put("states", self.states)  # With this scale, some may be none of its values.
+        return scaled
 
     def resolved(self, tags: Mapping[str, Tag]) -> Tag:
         """The tag with the register of its scale, which is among `tags`. Raises `TagError`."""
