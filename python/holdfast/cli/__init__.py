@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -241,6 +242,7 @@ class Program(SuggestingGroup):
             isinstance(command, CommandWithSubcommands)
             and left
             and left[0].isalpha()
+            and not Path(left[0]).exists()
             and not silent
         ):
             typed = {each: f"{name} {each}" for each in command.subcommands}

@@ -25,6 +25,9 @@ FILE_MODE = 0o644
 BLOCK = 1 << 20
 """How much of a file is read at a time."""
 
+MAX_LINE_BYTES = 1 << 20
+"""More bytes without an end of a line are none that a power failure has cut off."""
+
 
 class NotARecording(ValueError):
     """A file that has something else."""
@@ -85,6 +88,11 @@ class Recording:
                 "an empty file or a new one"
             )
         whole = self._whole()
+        if about.st_size - whole > MAX_LINE_BYTES:
+            raise NotARecording(
+                f"found {about.st_size - whole} bytes without the end of a line, as behind a quote "
+                "that stands alone, allowed: whole lines"
+            )
         if whole < about.st_size:
             self.removed = about.st_size - whole
             os.ftruncate(self._file, whole)
