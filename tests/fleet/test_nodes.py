@@ -333,6 +333,31 @@ def test_a_command_uses_the_newest_address_of_its_device(
     assert ([value for _, value in new.writes], former.writes) == ([7], [])
 
 
+def test_commands_stay_in_order_when_reads_overtake_each_other(
+    node: Callable[..., Running],
+    caller: Caller,
+    judges: Judges,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    running = node("a")
+    share(running)
+    [judge, *_] = judges.devices
+    assert caller.request("modbus.subscribe", wanted(judge))["success"]
+    turns = [20, 0]
+
+    async def read(_: str) -> None:
+        for _turn in range(turns.pop(0)):
+            await asyncio.sleep(0)
+
+    async def write_both() -> None:
+        write = running.scanner._commands.write
+        await asyncio.gather(*(write("d0", "t0", text, lambda: 10.0) for text in "56"))
+
+    monkeypatch.setattr(member_of(running.scanner).desired, "read", read)
+    running.do(write_both())
+    assert [value for _, value in judge.writes] == [5, 6]
+
+
 def test_a_command_is_refused_while_subscriptions_cant_be_read(
     node: Callable[..., Running], caller: Caller, judges: Judges
 ) -> None:

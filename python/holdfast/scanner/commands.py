@@ -102,6 +102,7 @@ class Commands:
         """
         # A tag may have been moved to another register by a request that another node has answered.
         await self._placement.refresh(device_id)
+        # No await from here to `Polling.write`, so that commands to a device stay in order.
         # Looked up again: the device may have been replaced while the command waited.
         device = self._registry.devices.get(device_id)
         if device is None or tag_id not in device.tags:

@@ -212,18 +212,23 @@ class FleetMember(Placement):
 
     async def _adopt(self, device: str) -> None:
         async with self._device_host.lock(device):
-            if self._applied.get(device, 0) != self.desired.revision(device):
-                await self._adopt_now(device)
+            await self._adopt_locked(device)
+
+    async def _adopt_locked(self, device: str) -> None:
+        if self._applied.get(device, 0) != self.desired.revision(device):
+            await self._adopt_now(device)
 
     async def refresh(self, device: str, /) -> None:
         """Carries out the latest change of a device. Raises `Refused` if it can't be read."""
-        try:
-            await self.desired.read(device)
-        except (Error, OSError) as error:
-            self._has_new_client.set()  # The bucket may be lost.
-            reason = nats_reason(error)
-            raise Refused(f"not written: {self.desired.bucket} can't be read: {reason}") from None
-        await self._adopt(device)
+        # The lock is taken first: it keeps the order of commands, whose reads may overtake each other.
+        async with self._device_host.lock(device):
+            try:
+                await self.desired.read(device)
+            except (Error, OSError) as error:
+                self._has_new_client.set()  # The bucket may be lost.
+                flaw = f"{self.desired.bucket} can't be read: {nats_reason(error)}"
+                raise Refused(f"not written: {flaw}") from None
+            await self._adopt_locked(device)
 
     async def _adopt_now(self, device: str) -> Refused | None:
         """Returns why it is refused here. Then this node does not know the device any more."""
