@@ -431,6 +431,8 @@ def test_browse_and_variables_tell_of_all_nodes(
         found = caller.request("modbus.browse", "")
         assert found["count"] == 4
         assert [each["state"] for each in found["devices"]] == ["online"] * 4
+        [device] = caller.request("modbus.browse", {"deviceId": "d1", "tagOffset": 0})["devices"]
+        assert (device["state"], len(device["tags"])) == ("online", 1)
         assert all(each["scans"] > 1 for each in found["devices"])
         assert found["service"]["fleet"]["nodes"] == ["a", "b"]
         values = caller.request("modbus.variables", "")

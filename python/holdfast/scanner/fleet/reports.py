@@ -49,11 +49,15 @@ class FleetReports:
         answer.count = len(self._registry.devices)
         shown: list[DeviceReport] = []
         room = self._own.max_bytes - ENVELOPE_BYTES
+        is_page = request.tag_offset is not None or answer.next_tag is not None
         for report in answer.devices:
-            # A page of tags is that of this node: the others report whole devices only.
-            if report.device_id in found and request.tag_offset is None:
+            if report.device_id in found:
                 with contextlib.suppress(msgspec.ValidationError):
-                    report = msgspec.convert(found[report.device_id], DeviceReport)
+                    polled = msgspec.convert(found[report.device_id], DeviceReport)
+                    if is_page:  # Its tags are those of this node: the others send no pages.
+                        polled.blocks, polled.tags = report.blocks, report.tags
+                        polled.subscribers = report.subscribers
+                    report = polled
             room -= len(msgspec.json.encode(report)) + 1
             if room < 0 and shown:
                 break

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
 _encode = msgspec.json.Encoder().encode
 
-ENVELOPE_BYTES = 300
-"""Bytes of an answer without devices."""
+ENVELOPE_BYTES = 1024
+"""Bytes of an answer without devices, and of the errors that the polling node adds to a page."""
 
 MIN_TAG_BYTES = 100
 """The fewest bytes of a tag in an answer. It limits how many tags can fit."""
