@@ -220,7 +220,7 @@ class FleetMember(Placement):
 
     async def refresh(self, device: str, /) -> None:
         """Carries out the latest change of a device. Raises `Refused` if it can't be read."""
-        # The lock is taken first: it keeps the order of commands, whose reads may overtake each other.
+        # Under the lock: reads may overtake each other, and commands must stay in order.
         async with self._device_host.lock(device):
             try:
                 await self.desired.read(device)
