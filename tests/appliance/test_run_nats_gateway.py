@@ -321,6 +321,38 @@ def test_a_reload_that_allows_a_device_again_restores_its_subscriptions(
     }
 
 
+def test_a_subscription_that_a_reload_refused_displaces_no_other(
+    run: Run, nats: NatsServer, caller: Caller, server: holdfast.Server, tmp_path: Path
+) -> None:
+    def reload(limits: str) -> None:
+        (tmp_path / "appliance.yaml").write_text(f"{text}  limits: {{{limits}}}\n")
+        assert appliance.reload(load(tmp_path / "appliance.yaml")) == ["nats"]
+        until_connected(appliance)
+
+    def subscribe(device: str, **more: int) -> None:
+        request = subscription(server, tag("a", 0), deviceId=device, **more)
+        assert caller.request("plant.subscribe", request)["success"] is True
+
+    def devices() -> list[str]:
+        return [each["deviceId"] for each in caller.request("plant.browse", b"")["devices"]]
+
+    text = MODBUS + nats_section(nats.url) + "  keep_subscriptions: false\n"
+    appliance = run(text)
+    until_connected(appliance)
+    subscribe("plc1")
+    subscribe("plc2")
+    subscribe("plc3", ttl=1000)
+    reload("devices: 1")
+    assert devices() == ["plc1"]
+    request = {"deviceId": "plc1", "subscriberId": "hmi", "tagIds": "all"}
+    assert caller.request("plant.unsubscribe", request)["success"] is True
+    subscribe("plc4")
+    reload("devices: 1, tags: 7")
+    assert devices() == ["plc4"]
+    reload("devices: 3")
+    assert devices() == ["plc2", "plc4"]  # The subscriber of plc3 repeats its request.
+
+
 def test_devices_outside_the_list_are_not_polled(
     run: Run, nats: NatsServer, caller: Caller, server: holdfast.Server
 ) -> None:

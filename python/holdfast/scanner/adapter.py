@@ -63,7 +63,7 @@ class ScannerAdapter:
             try:
                 await self._scanner.run()
             finally:
-                # After a failure, only what was not restored: the cause may be among the others.
+                # After a failure, only what was not tried yet: the cause may be among the others.
                 left = self._scanner.stored_requests() if stop.is_set() else self._scanner.former
                 self.subscriptions = list(left)
 

@@ -207,6 +207,7 @@ class Requests:
         async with self._devices.lock(subscription.device):
             await self._devices.add(subscription)
             self._devices.keep_only(subscription.device, subscription.subscriber, subscription.tags)
+        self.former.pop(SubscriptionKey(subscription.device, subscription.subscriber), None)
         self._log.subscribed(subscription)
 
     async def end_entry(self, subscription: SubscriptionKey) -> None:
@@ -215,6 +216,7 @@ class Requests:
         request = UnsubscribeRequest(subscription.device, subscription.subscriber)
         async with self._devices.lock(subscription.device):
             self._devices.remove(request)
+        self.former.pop(subscription, None)
         self._log.unsubscribed(request)
 
     async def restore(self, request: SubscribeRequest) -> None:

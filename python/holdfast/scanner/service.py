@@ -182,19 +182,21 @@ class Scanner:
             await self._requests.restore(request)
         except Refused as refused:
             log_lines.write(logging.WARNING, "not_restored", **about, reason=str(refused))
-            owner = SubscriptionKey(request.device_id, request.subscriber_id)
-            self._requests.former.setdefault(owner, []).append(request)
+            if request.ttl is None:  # Else its subscriber repeats it.
+                owner = SubscriptionKey(request.device_id, request.subscriber_id)
+                self._requests.former.setdefault(owner, []).append(request)
         else:
             log_lines.write(logging.INFO, "restored", **about, tags=len(request.tags))
 
     def stored_requests(self) -> Iterator[SubscribeRequest]:
         """Yields requests that make the subscriptions, except those from entries of a bucket."""
         yield from self.former
-        yield from chain.from_iterable(self._requests.former.values())
         for device in self._registry.devices.values():
             for subscriber in device.subscribers:
                 if not self._requests.is_entry(device.id, subscriber):
                     yield from map(restored, requests(device, subscriber))
+        # Last: a refused one must not displace one that is carried out.
+        yield from chain.from_iterable(self._requests.former.values())
 
     @property
     def serves(self) -> bool:
