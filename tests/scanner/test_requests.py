@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import jsonschema_rs
@@ -14,6 +15,7 @@ from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.schema import json_schema
 from holdfast.scanner.polling.allowed_devices import AllowedDevices
+from holdfast.scanner.subscriptions.conflicts import check_settings
 from holdfast.scanner.subscriptions.request_rules import ScannerLimits
 from support.brokers import free_port
 from support.nats_bus import leaving, subscription, tag
@@ -352,6 +354,15 @@ def test_a_host_with_several_addresses_is_tried_at_one_after_the_other(
         found.append(caller.do(allowed.address(asked, after=found[-1])))
     hosts = [each.host for each in found if isinstance(each, NetworkTarget)]
     assert hosts == ["10.0.0.1", "10.0.0.2", "fd00::1", "10.0.0.1"]
+
+
+def test_a_serial_line_has_one_name() -> None:
+    one: Any = SimpleNamespace(
+        id="one", source=SimpleNamespace(target=SerialTarget("rtu", "/dev/ttyNONE0"))
+    )
+    check_settings(SerialTarget("rtu", "/dev/ttyNONE0"), one)
+    with pytest.raises(Refused, match="is the serial line /dev/ttyNONE0 of one: use that name"):
+        check_settings(SerialTarget("rtu", "/dev/serial/by-id/none"), one)
 
 
 def test_serial_devices_beside_networks(caller: Caller) -> None:

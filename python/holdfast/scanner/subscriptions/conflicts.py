@@ -89,8 +89,12 @@ def check_subject(id: str, owners: Mapping[str, str]) -> None:
 
 def check_settings(target: Target, other: ScannedDevice) -> None:
     """Raises `Refused` if a target has not the settings of a device on the same connection."""
-    settings = _settings(target)
-    for key, known in _settings(other.source.target).items():
+    settings, shared = _settings(target), other.source.target
+    names = [each.device for each in (target, shared) if isinstance(each, SerialTarget)]
+    if len(set(names)) > 1:
+        # The poller would open the line once for each name, and only the first can have it.
+        raise Refused(f"{names[0]} is the serial line {names[1]} of {other.id}: use that name")
+    for key, known in _settings(shared).items():
         if known != settings[key]:
             at = "on one serial line" if isinstance(target, SerialTarget) else "at one address"
             raise Refused(
