@@ -50,7 +50,10 @@ KEEPING = {
 """Why memories that are kept refuse writes for now: a later attempt may succeed."""
 
 UNCERTAIN = ("device_refused", "internal_error")
-"""Reasons with which a write may have been carried out all the same."""
+"""Reasons of writes that may have been carried out.
+
+Without `not_confirmed`, which `MemoryAccess` records itself.
+"""
 
 
 def unreadable(error: OSError) -> str:

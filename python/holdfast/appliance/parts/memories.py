@@ -46,8 +46,11 @@ class Memories(Part):
 
     def prepare(self, plan: Plan) -> Callable[[], None]:
         """Creates memories that the configuration adds."""
-        names = plan.config.memories.keys() - self.by_name.keys()
-        added = {name: created(plan.config, name) for name in plan.config.memories if name in names}
+        added = {
+            name: created(plan.config, name)
+            for name in plan.config.memories
+            if name not in self.by_name
+        }
         plan.memories |= added
 
         def adopt() -> None:

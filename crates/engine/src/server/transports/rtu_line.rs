@@ -22,7 +22,8 @@ pub(super) struct RtuLine {
     bytes: [u8; MAX_BYTES],
     len: usize,
     silence: Duration,
-    /// Whether the silence is that of the standard, not one that was configured.
+    /// Whether to wait for the rest of a request: the silence is the default one, and shorter than
+    /// [`PACKET_PAUSE`].
     may_wait: bool,
     last: Instant,
     /// How many bytes there were at each silence after which the rest was waited for.
@@ -81,6 +82,7 @@ impl RtuLine {
     }
 
     fn append(&mut self, bytes: &[u8]) {
+        // When it is full, the last byte is written over: the frame stays too long.
         let at = self.len.min(MAX_BYTES - 1);
         self.len = MAX_BYTES.min(at + bytes.len());
         self.bytes[at..self.len].copy_from_slice(&bytes[..self.len - at]);
@@ -92,8 +94,8 @@ impl RtuLine {
         self.last + if self.is_waiting { PACKET_PAUSE } else { self.silence }
     }
 
-    /// After a silence: whether the rest is waited for, of an echo that has begun or of a request. Requests to
-    /// other units follow each other too soon for that, and the replies of others are no requests.
+    /// After a silence: whether to wait once more, for the rest of an echo or of a request to a served unit.
+    /// Never for other units: their next request comes too soon, and their replies look like incomplete requests.
     pub(super) fn waits_for_rest(&mut self, is_echo: bool, is_served: impl Fn(u8) -> bool) -> bool {
         let may_wait = is_echo
             || self.may_wait
@@ -202,7 +204,6 @@ mod tests {
             line.append(before);
             assert!(line.waits_for_rest(false, |_| true));
             line.append(&read);
-            line.skip(0);
             while line.waits_for_rest(false, |_| true) {
                 line.is_waiting = false;
             }
