@@ -36,11 +36,7 @@ def prepare() -> None:
 
 def is_screen() -> bool:
     """Whether text can be redrawn: not on a dumb terminal, as in an editor, nor without one."""
-    if not sys.stdout.isatty():
-        return False
-    from rich.console import Console  # It takes long to import.
-
-    return Console().is_interactive
+    return sys.stdout.isatty() and os.environ.get("TERM", "").lower() not in ("dumb", "unknown")
 
 
 def is_unwritable(error: OSError) -> bool:
