@@ -21,7 +21,7 @@ class ExitCode(IntEnum):
 
 
 MEANINGS = {
-    ExitCode.SUCCESS: "Done, or stopped by a signal.",
+    ExitCode.SUCCESS: "Done, or ended by a signal if it runs until then, as `watch` does.",
     ExitCode.FAILED: "The command failed: no answer, a refusal, or a search that ended early.",
     ExitCode.WRONG: "Wrong usage, or a configuration or file with errors. Nothing was done.",
     ExitCode.ATTENTION: "The command worked, and found a state that somebody must look at.",
