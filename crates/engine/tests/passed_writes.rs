@@ -149,8 +149,8 @@ fn a_journal_that_is_slow_holds_up_no_other_device() {
     assert_eq!(register(&kept), [0, 7]);
 }
 
-/// What changes in a device while a write to it is under way.
-fn assert_not_stored_after(change: impl FnOnce(&Poller, DeviceSettings)) {
+/// The outcome of a write, and what memory has then: the settings of its device change while it is under way.
+fn written_beside(change: impl FnOnce(&Poller, DeviceSettings)) -> (Result<(), u8>, [u8; 2]) {
     let memory = memory();
     let (sender, asked) = channel();
     let (answers, answer) = channel();
@@ -168,21 +168,32 @@ fn assert_not_stored_after(change: impl FnOnce(&Poller, DeviceSettings)) {
     let unknown = passage(&poller, "unknown", &memory);
     assert_eq!(written(unknown).recv_timeout(TIMEOUT), Ok(Err(0x0A)));
     answers.send(()).unwrap();
-    assert_eq!(outcome.recv_timeout(TIMEOUT), Ok(Err(0x0B)));
-    assert_eq!(register(&memory), [0, 0]);
+    (outcome.recv_timeout(TIMEOUT).unwrap(), register(&memory))
 }
 
 #[test]
 fn a_write_is_not_stored_where_its_device_is_no_longer_read_into() {
-    assert_not_stored_after(|poller, mut settings| {
+    let not_stored = (Err(0x0B), [0, 0]);
+    let beside = written_beside(|poller, mut settings| {
         settings.reads[0].into.as_mut().unwrap().address = 5;
         poller.replace("meter", settings, false).unwrap();
     });
-    assert_not_stored_after(|poller, mut settings| {
+    assert_eq!(beside, not_stored);
+    let beside = written_beside(|poller, mut settings| {
         settings.unit_id = 2;
         poller.replace("meter", settings, false).unwrap();
     });
-    assert_not_stored_after(|poller, _| assert!(poller.remove("meter")));
+    assert_eq!(beside, not_stored);
+    assert_eq!(written_beside(|poller, _| assert!(poller.remove("meter"))), not_stored);
+}
+
+#[test]
+fn a_write_is_stored_where_its_device_is_read_into_with_more_registers() {
+    let beside = written_beside(|poller, mut settings| {
+        settings.reads[0].count = 8;
+        poller.replace("meter", settings, false).unwrap();
+    });
+    assert_eq!(beside, (Ok(()), [0, 7]));
 }
 
 #[test]

@@ -337,14 +337,18 @@ impl PassedWrite {
         changes
     }
 
-    /// Whether the range still is what is read from the device.
+    /// Whether the range still is read from the device, to the same place.
     fn is_mirrored(&self, reads: &RefCell<Vec<ReadSettings>>) -> bool {
         let PassedRange { area, address, count, device_address, .. } = self.range;
+        let (address, there) = (u32::from(address), u32::from(device_address));
         reads.borrow().iter().any(|read| {
-            let here = (read.area, read.address, read.count) == (area, device_address, count);
-            here && read.into.as_ref().is_some_and(|into| {
+            let first = u32::from(read.address);
+            let has_all = first <= there && there + count <= first + read.count;
+            let into = read.into.as_ref().filter(|_| read.area == area && has_all);
+            into.is_some_and(|into| {
                 Arc::ptr_eq(&into.memory, &self.memory)
-                    && (into.area, into.address) == (area, address)
+                    && into.area == area
+                    && u32::from(into.address) + (there - first) == address
             })
         })
     }
