@@ -180,7 +180,7 @@ def test_what_the_source_did_not_read_is_left_out(read: Callable[[str], Imported
         "poll,holding_register,0,10,BE_BE\n"
         "ref,one,0,int16,r\n"
         "ref,same,0,uint16,r\n"
-        "ref,far,9,int32,r\n"
+        f"ref,far,9,string{'9' * 5000},r\n"
         "ref,set,2,int16,w\n"
         "ref,byte,3,uint8,r\n"
         "ref,short,4,int16\n"

@@ -154,7 +154,8 @@ class _Reference:
         """Registers, or bytes of coils."""
         if self.type.startswith("string"):
             length = self.type[len("string") :]
-            return (int(length) + 1) // 2 if length.isdecimal() else 1
+            # Longer than any poll anyway: Python converts no number of thousands of digits.
+            return (int(length[:9]) + 1) // 2 if length.isdecimal() else 1
         return (_WIDTHS | _LISTS).get(self.type, 1)
 
 
