@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.cli import main
+from holdfast.events import log_lines
 from holdfast.events.audit import Audit, verify
 from holdfast.events.audit.chain import digest_of
 
@@ -211,8 +212,13 @@ def test_copies_may_have_the_torn_line_whole_or_lack_it(log: Path, has_whole: bo
     assert verify([log]).error == f"{log}:{10 if has_whole else 9}: changed"
 
 
-def test_a_file_that_begins_with_a_torn_line_is_tied_to_the_one_before(log: Path) -> None:
+def test_a_file_that_begins_with_a_torn_line_is_tied_to_the_one_before(
+    log: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = log.rename(log.with_name("audit.log.1"))
+    time = json.loads(before.read_bytes().splitlines()[0])["time"]
+    # Then their numbers tell the order.
+    monkeypatch.setattr(log_lines, "timestamp", lambda _: time)
     audit = Audit(log, max_bytes=65536, keep=1)
     audit.close()
     log.write_bytes(b'{"time":"2026-')

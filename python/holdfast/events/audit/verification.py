@@ -259,16 +259,16 @@ def _after(files: Sequence[Path], line: Line) -> Iterator[Line]:
 def _in_order(files: Iterable[Path]) -> list[Path]:
     """Orders files by their chain: each after the one whose last line its first line names.
 
-    Files that nothing links are ordered by the time of their first lines.
+    Files that nothing links are ordered by the time of their first lines, then by their numbers.
     """
     ends: dict[str, Path] = {}
-    begins: dict[Path, tuple[str, str | None]] = {}
+    begins: dict[Path, tuple[tuple[str, int], str | None]] = {}
     for file in dict.fromkeys(files):
         # The first line may be torn.
         place = next((line.place for line in _lines([file]) if line.place is not None), None)
         last = last_lines(file)
-        time = "" if place is None else str(place.fields.get("time", ""))
-        begins[file] = (time, None if place is None else place.prev)
+        first = ("", 0) if place is None else (str(place.fields.get("time", "")), place.seq)
+        begins[file] = (first, None if place is None else place.prev)
         if last:
             ends[digest_of(last[-1])] = file
     followers = {ends[prev]: file for file, (_, prev) in begins.items() if prev in ends}
