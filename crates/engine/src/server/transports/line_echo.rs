@@ -16,11 +16,20 @@ pub(super) struct LineEcho {
     /// A reply that equals its request may come again as the next request.
     is_certain: bool,
     until: Option<Instant>,
+    /// Whether what has come since began before that.
     is_soon: bool,
-    /// Known from replies that differ from their requests.
-    has_echo: Option<bool>,
-    /// Whether it ever had one.
-    had_echo: bool,
+    known: Known,
+}
+
+/// What replies that differ from their requests have shown of the line.
+#[derive(Debug, Default, Clone, Copy)]
+enum Known {
+    #[default]
+    Nothing,
+    NoEcho,
+    Echo,
+    /// It had an echo, and one did not come back: it may have been damaged.
+    EchoOnce,
 }
 
 impl LineEcho {
@@ -45,12 +54,13 @@ impl LineEcho {
             Next::Incomplete if more_may_come => return 0,
             _ => {}
         }
-        let is_echo = match self.has_echo {
-            Some(false) if self.is_certain => self.is_soon,
-            known => known.unwrap_or(self.is_soon),
+        let is_echo = match self.known {
+            Known::Echo => true,
+            Known::NoEcho => self.is_certain && self.is_soon,
+            Known::Nothing | Known::EchoOnce => self.is_soon,
         };
         if self.is_certain && is_echo {
-            (self.has_echo, self.had_echo) = (Some(true), true);
+            self.known = Known::Echo;
         }
         let len = self.sent.len();
         self.sent.clear();
@@ -66,7 +76,10 @@ impl LineEcho {
     /// never counts as one without, or the echo of a write would be carried out as the next write.
     pub(super) fn request(&mut self) {
         if self.is_certain && !self.sent.is_empty() {
-            self.has_echo = if self.had_echo { None } else { Some(false) };
+            self.known = match self.known {
+                Known::Echo | Known::EchoOnce => Known::EchoOnce,
+                Known::Nothing | Known::NoEcho => Known::NoEcho,
+            };
         }
         self.sent.clear();
     }
