@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
 
-from holdfast.client.url import shared_connection, shared_options
+from holdfast.client.url import other_name, shared_connection, shared_options
 from holdfast.config.checks.units import routed
 from holdfast.config.fingerprint import fingerprint
 from holdfast.config.models.links import LinkConfig
@@ -126,12 +125,10 @@ def restart_reasons(before: Config, now: Config) -> Iterator[str]:
             keys = "in_flight, retry, tolerance or serial settings"
             yield f"devices.{name}: {keys} of a connection in use changed"
     # The connection with the former name still has the line, which nobody else can open then.
-    lines = {os.path.realpath(line): line for scheme, line in in_use if not scheme}
     users = [(f"links.{name}", link.target) for name, link in now.links.items()]
     users += [(f"devices.{name}", device.target) for name, device in _deciding_devices(now)]
     for key, target in users:
-        scheme, line = shared_connection(target)
-        if not scheme and lines.get(os.path.realpath(line), line) != line:
+        if other_name(target, in_use) is not None:
             yield f"{key}: another name of a serial line in use"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import asdict, dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
@@ -16,7 +17,7 @@ from holdfast.runtime.text import listing, suggestion
 from holdfast.types import SERIAL_FRAMES, TRANSPORTS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
     from pathlib import Path
 
     from holdfast.types import Transport
@@ -159,6 +160,15 @@ def shared_connection(target: Target) -> tuple[str, str]:
     if isinstance(target, SerialTarget):
         return "", target.device
     return target.transport, connection_of(target)
+
+
+def other_name(target: Target, connections: Iterable[tuple[str, str]]) -> str | None:
+    """The other name that one of these shared connections has for the serial line of a target."""
+    if not isinstance(target, SerialTarget):
+        return None
+    line = os.path.realpath(target.device)
+    names = (name for scheme, name in connections if not scheme and name != target.device)
+    return next((name for name in names if os.path.realpath(name) == line), None)
 
 
 def shared_options(target: Target) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 import time
 from collections import deque
 from dataclasses import replace
@@ -21,7 +20,7 @@ from holdfast.client.base import (
 )
 from holdfast.client.endpoint import endpoint
 from holdfast.client.requests import write_typed
-from holdfast.client.url import SerialTarget, parse, shared_connection, shared_options
+from holdfast.client.url import other_name, parse, shared_connection, shared_options
 from holdfast.polling.faults import LOST, fault_text
 from holdfast.polling.readings import Batch, Reader
 from holdfast.protocol import READ_BITS, READ_REGISTERS
@@ -131,8 +130,9 @@ class Poller:
         if name in self._core_names:
             raise ValueError(f"device {name}: the name is already in use")
         place = shared_connection(target)
-        if isinstance(target, SerialTarget):
-            self._check_name(url, target.device)
+        if (other := other_name(target, self._connections)) is not None:
+            named = f"{url!r} is the serial line of other devices under another name"
+            raise ValueError(f"{named}, allowed: {other!r}")
         options = shared_options(target) | {"in_flight": in_flight}
         known, users = self._connections.get(place, (options, set()))
         for option, value in options.items():
@@ -164,13 +164,6 @@ class Poller:
         self._readers[core_name] = reader
         self._core_names[name] = core_name
         return name
-
-    def _check_name(self, url: str, line: str) -> None:
-        """Raises `ValueError` if devices on a serial line have it under another name."""
-        for scheme, other in self._connections:
-            if not scheme and other != line and os.path.realpath(other) == os.path.realpath(line):
-                named = f"{url!r} is the serial line of other devices under another name"
-                raise ValueError(f"{named}, allowed: {other!r}")
 
     def _free(self, name: str) -> str:
         return name if name not in self._core_names else f"{name}#{next(self._names)}"
