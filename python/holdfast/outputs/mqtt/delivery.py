@@ -33,6 +33,11 @@ def packed_topic(topic: str) -> bytes:
     return len(data).to_bytes(2) + data
 
 
+def unpacked_topic(packed: bytes) -> str:
+    """The text of a `packed_topic`, which begins with its length."""
+    return packed[2:].decode()
+
+
 def packed(
     messages: Iterable[Message], identifiers: Iterable[int], *, qos: int, five: bool
 ) -> bytes:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.outputs.mqtt.availability import OFFLINE, ONLINE, Availability
 from holdfast.outputs.mqtt.commands import Commands
-from holdfast.outputs.mqtt.delivery import Message, packed_topic
+from holdfast.outputs.mqtt.delivery import Message, packed_topic, unpacked_topic
 from holdfast.outputs.mqtt.home_assistant import Discovery
 from holdfast.outputs.mqtt.messages import Payloads
 from holdfast.outputs.mqtt.receiver import BrokerReceiver
@@ -189,7 +189,7 @@ class MqttOutput(BrokerReceiver):
         if removal is None or not removal.is_done:
             return
         self._removal = None
-        for topic in (message.topic[2:].decode() for message in removal.messages):
+        for topic in (unpacked_topic(message.topic) for message in removal.messages):
             if self._site.retained.get((self._broker, topic)) == self._name:
                 del self._site.retained[self._broker, topic]
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
+from holdfast.outputs.mqtt.delivery import unpacked_topic
 from holdfast.outputs.sending import Receiver
 
 if TYPE_CHECKING:
@@ -83,6 +84,6 @@ class BrokerReceiver(Receiver):
             "output_not_accepted",
             kind=self._name,
             output=self._name,
-            topic=message.topic[2:].decode(),
+            topic=unpacked_topic(message.topic),
             reason=reason,
         )
