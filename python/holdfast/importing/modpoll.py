@@ -20,8 +20,9 @@ from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.importing.imported import Imported, NotImportable
 from holdfast.importing.names import free_name, unique_names
 from holdfast.importing.notes import Desk
-from holdfast.protocol import ADDRESSES, MAX_UNIT
+from holdfast.protocol import ADDRESSES, MAX_UNIT, WRITE_LIMITS
 from holdfast.types import AREAS, REGISTER_AREAS, Area
+from holdfast.values.orders import SWAPPED_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -38,7 +39,6 @@ _MIN_CELLS = {"device": 3, "poll": 5, "ref": 5}
 _AREAS: dict[str, Area] = dict(
     zip(("coil", "discrete_input", "holding_register", "input_register"), AREAS, strict=True)
 )
-_WRITABLE_AREAS = ("coils", "holding_registers")
 _MAX_BITS = 2000
 _MAX_REGISTERS = 123
 
@@ -284,7 +284,7 @@ def _take(desk: Desk, poll: _Poll, path: KeyPath, cells: list[str]) -> None:
         settings["scale"] = scale
     if len(cells) > 5 and (unit := " ".join(cells[5].split())):
         settings["unit"] = unit
-    if "w" in rights and poll.area in _WRITABLE_AREAS:
+    if "w" in rights and poll.area in WRITE_LIMITS:
         settings["writable"] = True
     name = cells[1].replace(" ", "_")
     reference = _Reference(path, name, address, bit, type_, settings)
@@ -329,7 +329,7 @@ def _scale(desk: Desk, path: KeyPath, text: str) -> float | None:
 
 def _tags(desk: Desk, poll: _Poll) -> Iterator[tuple[KeyPath, str, dict[str, Any]]]:
     """The tags of a poll of registers."""
-    swaps_bytes = poll.order in ("BADC", "DCBA")
+    swaps_bytes = poll.order in SWAPPED_BYTES
     for each in poll.references:
         place = {"area": poll.area, "address": each.address}
         if each.bit is not None:

@@ -36,7 +36,6 @@ class HostedService(ServiceFramework):
     def __init__(self, arguments: list[str]) -> None:
         super().__init__(arguments)
         self.control = ServiceControl(self.running, self.stopping)
-        self.is_stopped = False
 
     def GetAcceptedControls(self) -> int:
         """The requests of Windows that are answered."""
@@ -50,13 +49,12 @@ class HostedService(ServiceFramework):
             type(self).serve(self.control)
         except SystemExit as end:
             # After a stop on request, an error would make Windows start the service again.
-            if end.code and not self.is_stopped:
+            if end.code and not self.control.received:
                 raise ServiceFailed(f"exit code {end.code}: see {self.log}") from None
 
     def SvcStop(self) -> None:
         """Windows stops the service."""
         self.stopping()
-        self.is_stopped = True
         self.control.request_stop()
 
     SvcShutdown = SvcStop

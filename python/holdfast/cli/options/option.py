@@ -32,9 +32,8 @@ def option(
 
     The help shows its default, if there is one.
     """
-    if (
-        default is not None
-    ):  # Click takes `None` for a default, too: it would not ask for the option.
+    # Click takes `None` for a default too: it would not ask for an option that is required.
+    if default is not None:
         more = {"default": default, "show_default": default != "", **more}
     return click.option(*names.split(), type=type, metavar=metavar, help=help, **more)
 
