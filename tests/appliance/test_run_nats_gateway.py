@@ -236,6 +236,13 @@ def test_devices_are_polled_for_subscribers(
     assert 'holdfast_adapter_status{adapter="nats",field="devices"} 1.0' in scraped(appliance)
 
 
+def reload(appliance: Appliance, file: Path, text: str) -> None:
+    """Reloads a changed section `nats`, and waits until the scanner is connected."""
+    file.write_text(text)
+    assert appliance.reload(load(file)) == ["nats"]
+    until_connected(appliance)
+
+
 def test_after_a_reload_subscriptions_go_on(
     run: Run,
     nats: NatsServer,
@@ -244,17 +251,13 @@ def test_after_a_reload_subscriptions_go_on(
     tmp_path: Path,
     log: web.Records,
 ) -> None:
-    def reload(text: str) -> None:
-        (tmp_path / "appliance.yaml").write_text(text)
-        assert appliance.reload(load(tmp_path / "appliance.yaml")) == ["nats"]
-        until_connected(appliance)
-
+    file = tmp_path / "appliance.yaml"
     text = MODBUS + nats_section(nats.url) + "  keep_subscriptions: false\n"
     appliance = run(text)
     data = caller.listen("plant.data.plc1")
     assert subscribed(caller, server)["success"] is True
     data.next()
-    reload(text + "  limits: {tags: 7}\n")
+    reload(appliance, file, text + "  limits: {tags: 7}\n")
     assert caller.request("plant.browse", b"")["count"] == 1
     data.take()
     data.next()
@@ -264,25 +267,25 @@ def test_after_a_reload_subscriptions_go_on(
     # One that its files keep from starting loses nothing.
     (tmp_path / "ca.pem").write_text("no certificate")
     unusable = text + "  device_tls: {ca_file: ca.pem}\n"
-    (tmp_path / "appliance.yaml").write_text(unusable)
-    appliance.reload(load(tmp_path / "appliance.yaml"))
+    file.write_text(unusable)
+    appliance.reload(load(file))
     wire.until(lambda: log.of("adapter_failed"), "it has failed")
-    reload(text)
+    reload(appliance, file, text)
     assert caller.request("plant.browse", b"")["count"] == 1
 
     other = text.replace("prefix: plant", "prefix: other")
-    reload(other)
+    reload(appliance, file, other)
     assert caller.request("other.browse", b"")["count"] == 0
     assert subscribed(caller, server, "other")["success"] is True
-    (tmp_path / "appliance.yaml").write_text(MODBUS)
-    assert appliance.reload(load(tmp_path / "appliance.yaml")) == ["nats"]
-    reload(other)
+    file.write_text(MODBUS)
+    assert appliance.reload(load(file)) == ["nats"]
+    reload(appliance, file, other)
     assert caller.request("other.browse", b"")["count"] == 0
 
     assert subscribed(caller, server, "other")["success"] is True
     caller.publish("other.shutdown")
     wire.until(lambda: log.of("adapter_stopped"), "the scanner has ended")
-    reload(other + "  limits: {tags: 7}\n")
+    reload(appliance, file, other + "  limits: {tags: 7}\n")
     assert caller.request("other.browse", b"")["count"] == 0
 
 
@@ -294,11 +297,7 @@ def test_a_reload_that_allows_a_device_again_restores_its_subscriptions(
     tmp_path: Path,
     log: web.Records,
 ) -> None:
-    def reload(text: str) -> None:
-        (tmp_path / "appliance.yaml").write_text(text)
-        assert appliance.reload(load(tmp_path / "appliance.yaml")) == ["nats"]
-        until_connected(appliance)
-
+    file = tmp_path / "appliance.yaml"
     text = MODBUS + nats_section(nats.url) + "  keep_subscriptions: false\n"
     appliance = run(text)
     assert subscribed(caller, server)["success"] is True
@@ -307,13 +306,13 @@ def test_a_reload_that_allows_a_device_again_restores_its_subscriptions(
         assert caller.request("plant.subscribe", request)["success"] is True
     mistaken = text.replace("devices: [127.0.0.0/8]", "devices: [10.0.0.0/8]")
     for more in ("", "  limits: {tags: 7}\n"):
-        reload(mistaken + more)
+        reload(appliance, file, mistaken + more)
         assert caller.request("plant.browse", b"")["count"] == 0
     assert len(log.of("not_restored")) == 6
     for device, ids in (("plc2", "all"), ("plc3", ["b"])):
         request = {"deviceId": device, "subscriberId": "hmi", "tagIds": ids}
         assert caller.request("plant.unsubscribe", request)["success"] is True
-    reload(text)
+    reload(appliance, file, text)
     found = caller.request("plant.browse", b"")["devices"]
     assert {each["deviceId"]: [tag["id"] for tag in each["tags"]] for each in found} == {
         "plc1": ["a"],
@@ -324,10 +323,8 @@ def test_a_reload_that_allows_a_device_again_restores_its_subscriptions(
 def test_a_subscription_that_a_reload_refused_displaces_no_other(
     run: Run, nats: NatsServer, caller: Caller, server: holdfast.Server, tmp_path: Path
 ) -> None:
-    def reload(limits: str) -> None:
-        (tmp_path / "appliance.yaml").write_text(f"{text}  limits: {{{limits}}}\n")
-        assert appliance.reload(load(tmp_path / "appliance.yaml")) == ["nats"]
-        until_connected(appliance)
+    def reload_with(limits: str) -> None:
+        reload(appliance, tmp_path / "appliance.yaml", f"{text}  limits: {{{limits}}}\n")
 
     def subscribe(device: str, **more: int) -> None:
         request = subscription(server, tag("a", 0), deviceId=device, **more)
@@ -342,14 +339,14 @@ def test_a_subscription_that_a_reload_refused_displaces_no_other(
     subscribe("plc1")
     subscribe("plc2")
     subscribe("plc3", ttl=1000)
-    reload("devices: 1")
+    reload_with("devices: 1")
     assert devices() == ["plc1"]
     request = {"deviceId": "plc1", "subscriberId": "hmi", "tagIds": "all"}
     assert caller.request("plant.unsubscribe", request)["success"] is True
     subscribe("plc4")
-    reload("devices: 1, tags: 7")
+    reload_with("devices: 1, tags: 7")
     assert devices() == ["plc4"]
-    reload("devices: 3")
+    reload_with("devices: 3")
     assert devices() == ["plc2", "plc4"]  # The subscriber of plc3 repeats its request.
 
 
