@@ -138,7 +138,7 @@ def test_datagrams_and_packets_are_audited(run: Run, tmp_path: Path) -> None:
             sender.recv(1)
     raw = {"listener": "raw", "function": "raw-ingest"}
     registers = {"memory_id": 3, "area": "holding_registers"}
-    assert audited(tmp_path, 5) == [
+    expected = [
         {
             "listener": "datagrams",
             "unit": 1,
@@ -160,6 +160,8 @@ def test_datagrams_and_packets_are_audited(run: Run, tmp_path: Path) -> None:
         {**raw, **registers, "address": 9, "count": 2, "outcome": "range"},
         {**raw, "outcome": "short"},
     ]
+    # The order of refused writes among those that were done is open.
+    assert sorted(audited(tmp_path, 5), key=str) == sorted(expected, key=str)
 
 
 def test_what_a_service_writes_is_audited_before_it_is_answered(run: Run, tmp_path: Path) -> None:
