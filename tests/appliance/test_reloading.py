@@ -12,7 +12,7 @@ import pytest
 from holdfast.appliance.service_manager import ServiceManager
 from holdfast.cli.configuration import load_whole
 from holdfast.cli.services import reloader
-from holdfast.cli.services.file_snapshot import FileSnapshot
+from holdfast.cli.services.changed_files import FileSnapshot
 from holdfast.cli.services.reloader import Reloader
 from support import wire
 from support.silent_files import Silent, threads

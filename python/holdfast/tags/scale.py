@@ -137,10 +137,6 @@ class Linear:
         """The number in the registers for a finite value."""
         return (_exact(value) - self._offset) / self._scale
 
-    def nearest(self, value: float) -> int:
-        """The integer in the registers that is nearest to a finite value."""
-        return round(self.number(value))  # Of two equally near ones the even one.
-
 
 def is_finite(number: float) -> bool:
     """Whether a number is finite, and no integer beyond all floats."""

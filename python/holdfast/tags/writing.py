@@ -91,7 +91,7 @@ class WritableTag(ScaledTag):
         exact = self._linear.number(value)
         if exact.denominator == 1:
             return exact.numerator
-        nearest = self._linear.nearest(value)
+        nearest = round(exact)  # Of two equally near ones the even one.
         rounded = self._linear.value(nearest)
         if rounded == value:
             return nearest  # A read returns this value: a float has not all digits of the scale.

@@ -27,6 +27,7 @@
 
 mod attempts;
 mod connection;
+mod echo;
 mod flights;
 mod late_replies_without_ids;
 mod mbap_datagrams;
@@ -37,11 +38,12 @@ mod tolerance;
 
 pub use attempts::{Attempt, BUSY_PAUSE};
 pub use connection::{Connection, Past};
+pub use echo::Echo;
 pub use flights::{Done, Strays, Ticket};
 pub use late_replies_without_ids::{GUARD, MAX_LATENESS};
 pub use mbap_datagrams::{MAX_STRAY_DATAGRAMS, UDP_ATTEMPTS};
 pub use rtu_and_ascii::TURNAROUND;
-pub use tolerance::{AcceptUnit, Echo, Tolerance};
+pub use tolerance::{AcceptUnit, Tolerance};
 
 use core::time::Duration;
 

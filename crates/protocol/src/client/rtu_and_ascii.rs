@@ -8,9 +8,9 @@ use alloc::vec::Vec;
 use core::time::Duration;
 
 use super::attempts::Attempt;
+use super::echo::Echo;
 use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::late_replies_without_ids::{Ended, GUARD, LateReplies};
-use super::tolerance::Echo;
 use super::{Closed, Failure, InvalidResponse, Time};
 use crate::frame::{FrameError, ascii, rtu};
 use crate::pdu::{self, EncodedRequest, ExceptionCode, Response, ResponseError};

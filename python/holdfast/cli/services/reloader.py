@@ -15,7 +15,7 @@ import click
 
 from holdfast.adapters.plugins import UnknownAdapter
 from holdfast.appliance.reload import ReloadIncomplete, ReloadRefused, described
-from holdfast.cli.services.file_snapshot import FileSnapshot
+from holdfast.cli.services.changed_files import FileSnapshot
 from holdfast.cli.services.open_files import allow_open_files
 from holdfast.cli.shell_command import shell_command
 from holdfast.config import ConfigError
