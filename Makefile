@@ -104,6 +104,7 @@ lint: no-std .venv/core.stamp .venv/dev.stamp
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/mypy --platform win32 --cache-dir .mypy_cache/windows python/holdfast
 	@$(BIN)/lint-imports --no-logo --cache-dir .cache/imports > .cache/imports.log || { cat .cache/imports.log; exit 1; }
 	$(BIN)/python -m mypy.stubtest holdfast._core
 

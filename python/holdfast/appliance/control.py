@@ -195,12 +195,18 @@ def _is_forged(folder: Path) -> bool:
     if folder != _temporary():
         return False
     with contextlib.suppress(OSError):
-        return folder.lstat().st_uid != os.getuid()
+        return folder.lstat().st_uid != _user()
     return False
 
 
 def _temporary() -> Path:
-    return Path(tempfile.gettempdir()) / f"holdfast-{os.getuid()}"
+    return Path(tempfile.gettempdir()) / f"holdfast-{_user()}"
+
+
+def _user() -> int:
+    if sys.platform == "win32":
+        raise AssertionError("only called on other systems")
+    return os.getuid()
 
 
 def _folders() -> Iterator[Path]:

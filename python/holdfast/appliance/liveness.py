@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,9 +74,11 @@ class Liveness:
 
 def cpu_time(number: int | None) -> float | None:
     """Returns the processor time of a thread of this process; `None` where it is not known."""
+    if sys.platform != "linux":
+        return None
     try:
         stat = Path(f"/proc/self/task/{number}/stat").read_text()
-    except OSError:  # Not Linux, or the thread has ended.
+    except OSError:  # The thread has ended.
         return None
     # Behind the name in parentheses: the state, and 10 fields before utime and stime.
     user, system = stat.rpartition(")")[2].split()[11:13]

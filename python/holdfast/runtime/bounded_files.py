@@ -12,6 +12,7 @@ import errno
 import os
 import select
 import stat
+import sys
 import threading
 import time
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, TypeAlias, TypeVar, cast
@@ -261,6 +262,8 @@ def _content(file: File, max_bytes: int, named_pipe: bool, timeout_ms: int) -> b
 
 def _wait(descriptor: int, wait_ms: float) -> bool:
     """Waits until there is something to read. Returns whether the last writer has left."""
+    if sys.platform == "win32":
+        raise AssertionError("only called on other systems")
     poll = select.poll()
     poll.register(descriptor, select.POLLIN)
     return any(events & select.POLLHUP for _, events in poll.poll(wait_ms))

@@ -184,7 +184,7 @@ class ChildProcess:
             # Ctrl-C must not reach the program: this process still needs it for its last work.
             start_new_session=True,
             creationflags=_FLAGS,
-            pass_fds=() if sys.platform == "win32" or inherited is None else (inherited,),
+            pass_fds=() if inherited is None or sys.platform == "win32" else (inherited,),
         )
         if sys.platform == "win32":
             from holdfast.runtime import windows_job

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import math
+import sys
 import time
 
 from holdfast.events import log_lines
@@ -18,12 +19,12 @@ after it has renewed its lease."""
 MAX_LOOK_INTERVAL_S = STANDSTILL_S / 4
 """Seconds between two looks, at most, while the thread or event loop runs."""
 
-_CLOCK: int | None = getattr(time, "CLOCK_BOOTTIME", None)
-
 
 def now() -> float:
     """Returns seconds of a clock that goes on while the machine is suspended, if it has one."""
-    return time.monotonic() if _CLOCK is None else time.clock_gettime(_CLOCK)
+    if sys.platform == "linux":
+        return time.clock_gettime(time.CLOCK_BOOTTIME)
+    return time.monotonic()
 
 
 class Standstill:

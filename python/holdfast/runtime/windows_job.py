@@ -45,7 +45,8 @@ def join(process: subprocess.Popen[Any]) -> None:
     """Has a process end with this one. Raises `OSError`."""
     if sys.platform == "win32":
         kernel, job = _job()
-        if not kernel.AssignProcessToJobObject(job, wintypes.HANDLE(int(process._handle))):
+        handle = wintypes.HANDLE(int(process._handle))  # type: ignore[attr-defined]
+        if not kernel.AssignProcessToJobObject(job, handle):
             raise ctypes.WinError(ctypes.get_last_error())
 
 

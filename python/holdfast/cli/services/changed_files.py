@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 
 from holdfast.runtime.bounded_files import call
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 Change: TypeAlias = Literal["replaced", "written", "removed"]
-
-_PATH_ONLY = getattr(os, "O_PATH", 0)
-"""Opens a file without access to its content. Without it, systems don't use a number again soon."""
 
 
 class State(NamedTuple):
@@ -92,9 +90,10 @@ class FileSnapshot:
 
     def _state(self, file: Path, hold: bool) -> State | None:
         held: _Held | None = None
-        if hold and _PATH_ONLY:
+        # Other systems don't use a number again soon.
+        if hold and sys.platform == "linux":
             with contextlib.suppress(OSError):
-                held = _Held(call(file, os.open, file, _PATH_ONLY | os.O_CLOEXEC))
+                held = _Held(call(file, os.open, file, os.O_PATH | os.O_CLOEXEC))
         try:
             status = call(file, os.stat, file if held is None else held.descriptor)
         except OSError:

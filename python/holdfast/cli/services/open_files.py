@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import sys
 from typing import TYPE_CHECKING
 
 from holdfast.appliance.services.gateway import gateway_settings
@@ -26,10 +27,10 @@ def allow_open_files(config: Config, file: Path | None) -> None:
 
 def raise_open_file_limit(connections: int) -> None:
     """Raises the limit on open files for `connections`; logs if the system does not allow it."""
-    try:
-        import resource
-    except ImportError:  # Windows has no such limit.
+    if sys.platform == "win32":  # It has no such limit.
         return
+    import resource
+
     needed = connections + OTHER_FILES
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY or soft >= needed:
