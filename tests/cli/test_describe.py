@@ -109,6 +109,30 @@ def test_nothing_is_written_to_the_device() -> None:
         assert {pdu[0] for pdu in device.asked} == {1, 2, 3, 4, 17, 43}
 
 
+def test_failures_are_printed_and_counted() -> None:
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] == 3:
+            return exception(pdu, 4 if first <= 5 < first + count else 2)
+        return exception(pdu, 1)
+
+    with FakeDevice(answers) as device:
+        options = ("--units", "1", "--areas", "hr,ir", "--range", "0-9", "--exact")
+        shown = done("describe", device.url, *options)
+        areas = answer("describe", device.url, *options)["units"][0]["areas"]
+    assert [line.split() for line in shown if "_registers " in line] == [
+        ["holding_registers", "yes", "0", "9", "1", "0"],
+        ["input_registers", "skipped", "0", "0", "1", "9"],
+    ]
+    assert shown[-2:] == [
+        "holding_registers: exception 04 (Server Device Failure) at 5",
+        "input_registers: exception 01 (Illegal Function); area skipped",
+    ]
+    [failed] = areas["holding_registers"]["failures"]
+    assert (failed["code"], failed["ranges"]) == (4, [[5, 5]])
+    assert areas["input_registers"]["given_up"]["code"] == 1
+
+
 def test_a_device_that_ignores_unit_ids_is_described_once() -> None:
     def answers(pdu: bytes) -> bytes:
         first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])

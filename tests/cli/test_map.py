@@ -58,7 +58,7 @@ def test_ranges_are_a_picture_and_a_table(url: str) -> None:
     assert re.fullmatch(r"input registers +·{59}▁", registers)
     assert scale.split() == ["0", "16384", "32768", "49152", "65535"]
     rows = [line.split() for line in table[:5]]
-    assert rows[0] == ["area", "searched", "exist", "absent", "not", "asked"]
+    assert rows[0] == ["area", "searched", "exist", "absent", "failed", "not", "asked"]
     for area, searched, *counts in rows[1:]:
         assert (area in AREAS, searched) == (True, "yes")
         assert sum(map(int, counts)) == 65536
@@ -241,7 +241,7 @@ def test_what_was_found_is_shown_when_it_is_interrupted() -> None:
         "Incomplete. Not searched: holding_registers from 0 on (only some usual starts there)."
         in shown
     )
-    [(exist, unknown)] = re.findall(r"^holding_registers +starts +(\d+) +0 +(\d+)$", shown, re.M)
+    [(exist, unknown)] = re.findall(r"^holding_registers +starts +(\d+) +0 +0 +(\d+)$", shown, re.M)
     assert int(exist) + int(unknown) == 65536
 
 
@@ -266,7 +266,7 @@ def test_a_search_ends_after_its_requests_and_says_what_was_not_asked() -> None:
     )
     assert result.exit_code == 1
     assert "incomplete, 30 requests" in result.stdout
-    assert re.search(r"^input_registers +starts +5 +\d+ +\d+$", result.stdout, re.M)
+    assert re.search(r"^input_registers +starts +5 +\d+ +0 +\d+$", result.stdout, re.M)
 
 
 def test_requests_can_be_apart(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,7 +81,9 @@ def described_lines(found: Description, most: int | None) -> list[str]:
     left = [f"{area} {span.start}-{span.stop - 1}" for area, span in undescribed(found)]
     if left:
         counts.append(f"Incomplete. Not described: {', '.join(left)}.")
-    parts = (orders, tags, counts, () if found.survey.exact else coverage.unknown(found.survey))
+    failures = coverage.failures(found.survey)
+    limits = () if found.survey.exact else coverage.unknown(found.survey)
+    parts = (orders, tags, counts, failures, limits)
     return [line for part in parts if part for line in ("", *part)]
 
 
@@ -214,6 +216,7 @@ def unit_to_json(found: Description) -> dict[str, object]:
                 "absent": sum(map(len, each.absent)),
                 "not_asked": len(found.survey.span) - each.asked,
                 "not_searched_from": found.survey.not_searched_from(each),
+                **coverage.failures_to_json(found.survey, each),
             }
             for each in found.survey.areas
         },

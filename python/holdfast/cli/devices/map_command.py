@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 import sys
 import time
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
 
     from holdfast.cli.options.search import Settings
     from holdfast.client import SyncClient
-    from holdfast.discovery.address_search import AreaMap, Failure
+    from holdfast.discovery.address_search import AreaMap
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 ABSENT = "·"
@@ -54,8 +53,8 @@ def map_(
     """Find the addresses of the device at URL by reading; nothing is written.
 
     An address exists if reading it succeeds, and is absent if reading it returns exception 02.
-    Other exceptions, timeouts and invalid replies are listed separately. Addresses that were not
-    asked are counted: nothing is known about them.
+    Other exceptions, timeouts and invalid replies are counted as failed, and listed. Addresses that
+    were not asked are counted: nothing is known about them.
 
     Without --exact, reads samples: the first 16, multiples of 10 below 10000 and of 100 above, the
     addresses after them (101, 1001), multiples of 10 from 30000 and 40000 to 1000 addresses later,
@@ -121,6 +120,7 @@ def _summary(device: str, survey: Survey, seconds: float) -> list[str]:
     """The findings of a survey, without the table of its ranges."""
     found = terminal_text.counted(sum(each.addresses for each in survey.areas), "address")
     head = f"{device}: {found}; {_how(survey)}, {_requests(survey)} in {seconds:.1f} s"
+    failures = coverage.failures(survey)
     is_empty = not any(each.ranges for each in survey.areas)
     return [
         *([] if is_empty else [""]),
@@ -129,7 +129,8 @@ def _summary(device: str, survey: Survey, seconds: float) -> list[str]:
         "",
         *_picture(survey),
         *(["", "No address was found."] if is_empty else []),
-        *_others(survey),
+        *([""] if failures else []),
+        *failures,
         *_unknown(survey),
     ]
 
@@ -206,23 +207,6 @@ def _bounds(span: range, cells: int, cell: int) -> tuple[int, int]:
     return span.start + -(-cell * size // cells), span.start + -(-(cell + 1) * size // cells)
 
 
-def _others(survey: Survey) -> list[str]:
-    """The failures other than exception 02, one line each."""
-    lines = []
-    for found in survey.areas:
-        if found.given_up is not None:
-            lines.append(f"{found.area}: {_words(survey, found.given_up)}; area skipped")
-            continue
-        for failure, ranges in found.failures.items():
-            where = ", ".join(
-                str(each.start) if len(each) == 1 else f"{each.start}-{each.stop - 1}"
-                for each in ranges[:8]
-            )
-            more = f", and {len(ranges) - 8} more" if len(ranges) > 8 else ""
-            lines.append(f"{found.area}: {_words(survey, failure)} at {where}{more}")
-    return ["", *lines] if lines else []
-
-
 def _unknown(survey: Survey) -> list[str]:
     """The limits of the search; nothing if every address was asked."""
     if survey.is_done and survey.exact:
@@ -232,11 +216,6 @@ def _unknown(survey: Survey) -> list[str]:
         *coverage.counts(survey),
         *([] if survey.exact else ["", *coverage.unknown(survey)]),
     ]
-
-
-def _words(survey: Survey, failure: Failure) -> str:
-    text = survey.texts.get(failure, str(failure))
-    return terminal_text.styled(re.sub(r"\s+", " ", text), fg="red")
 
 
 def _to_json(survey: Survey, seconds: float) -> dict[str, object]:
@@ -258,27 +237,11 @@ def _area(survey: Survey, found: AreaMap) -> dict[str, object]:
         "state": found.state,
         "searched_to": None if found.reached in (None, survey.span.start) else found.reached - 1,
         "not_searched_from": survey.not_searched_from(found),
-        "ranges": _pairs(found.ranges),
+        "ranges": coverage.pairs(found.ranges),
         "addresses": found.addresses,
-        "absent": _pairs(found.absent),
+        "absent": coverage.pairs(found.absent),
         "not_asked": len(survey.span) - found.asked,
-        "failures": [
-            {**_reason(survey, failure), "ranges": _pairs(ranges)}
-            for failure, ranges in found.failures.items()
-        ],
-        "given_up": None if found.given_up is None else _reason(survey, found.given_up),
+        **coverage.failures_to_json(survey, found),
         "largest_read": found.largest,
         "requests": found.requests,
     }
-
-
-def _reason(survey: Survey, failure: Failure) -> dict[str, object]:
-    detail = {"detail": survey.texts.get(failure, str(failure))}
-    if isinstance(failure, int):
-        return {"reason": "exception", "code": failure, **detail}
-    return {"reason": failure, **detail}
-
-
-def _pairs(ranges: Iterable[range]) -> list[list[int]]:
-    """First and last address of each range."""
-    return [[each.start, each.stop - 1] for each in ranges]
