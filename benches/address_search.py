@@ -69,6 +69,7 @@ def devices() -> dict[str, tuple[list[range], Device]]:
     blocks = [range(500), range(1000, 1300), range(5000, 5700)]
     single = [range(at, at + 1) for at in range(0, 400, 2)]
     everything = [range(ADDRESSES)]
+    floats = [range(36), range(52, 54), range(70, 76)]
     return {
         "16 short ranges": (short, having(short)),
         "30 ranges of 20 to 200, anywhere": (anywhere := scattered(30, 20, 200), having(anywhere)),
@@ -78,19 +79,23 @@ def devices() -> dict[str, tuple[list[range], Device]]:
         "SunSpec": (sunspec := [range(40_000, 40_180)], having(sunspec)),
         "zeros everywhere": (everything, having(everything)),
         "zeros everywhere, 32 a read": (everything, having(everything, most=32)),
+        "22 floats, only read whole": (floats, having(floats, width=2)),
         "nothing": ([], having([])),
         "function not supported": ([], lambda _: ILLEGAL_FUNCTION),
     }
 
 
-def having(layout: Iterable[range], most: int = 125) -> Device:
-    """A device with these addresses, which reads at most so many at once."""
+def having(layout: Iterable[range], most: int = 125, width: int = 1) -> Device:
+    """A device with these addresses, which reads at most so many at once, and only whole values of
+    `width` registers."""
     addresses = {address for each in layout for address in each}
 
     def answer(probe: Probe) -> Outcome:
         if probe.count > most:
             return ILLEGAL_VALUE
         asked = range(probe.address, probe.address + probe.count)
+        if asked.start % width or asked.stop % width:
+            return ILLEGAL_ADDRESS
         return None if addresses.issuperset(asked) else ILLEGAL_ADDRESS
 
     return answer

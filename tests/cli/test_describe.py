@@ -25,7 +25,7 @@ from holdfast.tags import Tag
 from support import cli, sunspec_device, wire
 from support.cli import answer, done, usage_error
 from support.commands import Command
-from support.fake_device import FakeDevice, Stream, exception, registers, silent
+from support.fake_device import FakeDevice, Stream, exception, registers, silent, whole_floats
 from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
@@ -107,6 +107,16 @@ def test_nothing_is_written_to_the_device() -> None:
     with FakeDevice(answers) as device:
         assert cli.invoke("describe", device.url, "--units", "1", "--times", "1").exit_code == 0
         assert {pdu[0] for pdu in device.asked} == {1, 2, 3, 4, 17, 43}
+
+
+@pytest.mark.parametrize("code", [2, 3])
+def test_a_meter_that_only_gives_whole_values_is_described(code: int) -> None:
+    with FakeDevice(whole_floats(code)) as device:
+        options = ("--units", "1", "--areas", "ir", "--range", "0-399", "--times", "1")
+        found = answer("describe", device.url, *options)
+    [unit] = found["units"]
+    assert unit["areas"]["input_registers"]["exist"] == 300
+    assert unit["tags"][0]["type"] == "float32"
 
 
 def test_failures_are_printed_and_counted() -> None:

@@ -18,7 +18,7 @@ from holdfast.config import load
 from support import cli, wire
 from support.cli import answer, failure, invoke, usage_error
 from support.commands import Command
-from support.fake_device import FakeDevice, exception, registers
+from support.fake_device import FakeDevice, exception, registers, whole_floats
 from support.running import endpoint
 from support.terminal import Terminal, plain
 from support.web import token
@@ -141,6 +141,16 @@ def test_all_that_a_device_has_is_watched_if_nothing_is_named(
     assert watching.line().split()[1:] == ["discrete_inputs", "9:", "0", "->", "1"]
     assert watching.line().split()[1:] == ["input_registers", "1009:", "0", "->", "7", "+7"]
     assert watching.end() == 0
+
+
+def test_a_meter_that_only_gives_whole_values_is_watched(watch: Callable[..., Watch]) -> None:
+    with FakeDevice(whole_floats(2)) as device:
+        watching = watch(device.url)
+        assert watching.process.stderr is not None
+        assert watching.process.stderr.readline() == f"watching {device.url}, unit 1\n"
+        asked = len(device.asked)
+        wire.until(lambda: len(device.asked) > asked + 5, "it reads")
+        assert watching.end() == 0
 
 
 def test_errors_are_told_and_it_goes_on(watch: Callable[..., Watch]) -> None:

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 HR: list[Area] = ["holding_registers"]
 OUTSIDE = 2
+VALUE_READS = 2 * 36
+"""The most reads of two and four registers where none can be read alone."""
 
 
 @st.composite
@@ -49,6 +51,16 @@ def device(present: Iterable[range], *, largest: int = 2000, too_large: int = 3)
         asked = range(probe.address, probe.address + probe.count)
         inside = any(asked[0] in each and asked[-1] in each for each in addresses)
         return None if inside else OUTSIDE
+
+    return answer
+
+
+def whole(present: Iterable[range], width: int, code: Outcome = OUTSIDE) -> Model:
+    """A device with these addresses, which only reads whole values of so many registers."""
+    truth = device(present)
+
+    def answer(probe: Probe) -> Outcome:
+        return code if probe.address % width or probe.count % width else truth(probe)
 
     return answer
 
@@ -76,8 +88,10 @@ def mapped(model: Model, areas: Sequence[Area] = HR, **options: object) -> AreaM
     return survey.areas[0]
 
 
-def follow_cost(present: Iterable[range], limit: int) -> int:
-    """The most reads that following ranges may take, both ways."""
+def follow_cost(present: Sequence[range], limit: int) -> int:
+    """The most reads that following ranges may take, both ways, or a search for whole values."""
+    if not present:
+        return VALUE_READS
     halvings = math.ceil(math.log2(limit)) + 1
     return sum(len(each) // limit + 4 * halvings + 4 for each in present)
 
@@ -147,7 +161,7 @@ def test_fast_finds_ranges_where_devices_like_to_have_them(layout: list[range]) 
 @settings(max_examples=examples(15))
 def test_fast_takes_few_reads(layout: list[range]) -> None:
     found = mapped(device(layout))
-    assert found.requests <= 2200 + follow_cost(layout, 125) + 8 * len(layout)
+    assert found.requests <= 2200 + follow_cost(found.ranges, 125) + 8 * len(layout)
 
 
 @pytest.mark.parametrize("exact", [False, True])
@@ -162,12 +176,16 @@ def test_registers_at_usual_starts_come_first_then_other_registers_then_bits() -
     registers, bits = ("holding_registers", "input_registers"), ("coils", "discrete_inputs")
     samples = address_search.sample_places(range(65536))
     others = [each for each in samples if each not in address_search.USUAL_STARTS]
-    assert [(probe.area, probe.address) for probe in probes] == [
+    assert [(probe.area, probe.address) for probe in probes if probe.count == 1] == [
         (area, address)
         for areas in (registers, bits)
         for addresses in (address_search.USUAL_STARTS, others)
         for address in addresses
         for area in areas
+    ]
+    values = probes[2 * len(samples) : -2 * len(samples)]
+    assert [(probe.area, probe.count) for probe in values] == [
+        (area, width) for area in registers for width in (2, 4) for _ in range(VALUE_READS // 2)
     ]
 
 
@@ -193,7 +211,7 @@ SHORT_RANGES = [
         ([range(65536)], 2000, 532),
         ([range(500), range(1000, 1300), range(5000, 5700)], 64, 2064),
         ([range(40000, 40180)], 2000, 2164),
-        ([], 2000, 2161),
+        ([], 2000, 2161 + VALUE_READS),
     ],
     ids=["sparse", "dense", "everything", "small blocks", "sunspec", "empty"],
 )
@@ -219,7 +237,7 @@ def test_the_order_costs_no_more_reads_than_that_of_the_addresses(
         ([range(65536)], 2000, (532, 1), (532, 1)),
         ([range(65536)], 32, (2059, 1), (2059, 1)),
         ([range(40000, 40180)], 2000, (2164, 1), (599, 1)),
-        ([], 2000, (2161, 0), (577, 0)),
+        ([], 2000, (2161 + VALUE_READS, 0), (577 + 68, 0)),
     ],
     ids=["short", "small blocks", "single", "everything", "32 at once", "sunspec", "empty"],
 )
@@ -366,6 +384,44 @@ def test_a_reply_that_is_lost_once_does_no_harm() -> None:
 
     found = mapped(model, exact=True, span=range(100))
     assert (found.ranges, found.failures) == ([range(10, 90)], {})
+
+
+@pytest.mark.parametrize("exact", [False, True], ids=["samples", "exact"])
+@pytest.mark.parametrize("code", [2, 3])
+@pytest.mark.parametrize("width", [2, 4])
+@pytest.mark.parametrize("quantity", [None, 7])
+def test_values_that_can_not_be_read_in_part_are_found(
+    exact: bool, code: int, width: int, quantity: int | None
+) -> None:
+    layout = [range(40, 44), range(52, 60), range(1000, 1300)]
+    span = range(33, 1297)
+    survey = Survey(HR, exact=exact, span=span, max_quantity=quantity)
+    probes = carried_out(survey, whole(layout, width, code))
+    [found] = survey.areas
+    assert found.ranges == [*layout[:2], range(1000, 1296)]
+    assert found.asked == found.addresses + sum(
+        len(each) for ranges in (found.absent, *found.failures.values()) for each in ranges
+    )
+    if exact:  # A value at the last address would leave the span.
+        assert len(span) - found.asked == 1
+    assert min(probe.address for probe in probes) == span.start
+    assert max(probe.address + probe.count for probe in probes) == span.stop
+    assert found.largest <= (quantity or 125)
+    assert (found.state, survey.at) == ("searched", survey.total)
+
+
+def test_bits_are_only_read_alone_where_nothing_is_found() -> None:
+    probes = carried_out(Survey(["coils"]), whole([range(8)], 2))
+    assert {probe.count for probe in probes} == {1}
+
+
+def test_a_search_for_whole_values_that_ends_early_says_where_it_did_not_look() -> None:
+    survey = Survey(HR, max_requests=2161 + 60)
+    with pytest.raises(address_search.LimitReached):
+        carried_out(survey, whole([range(100, 120)], 2))
+    [found] = survey.areas
+    assert (found.state, found.ranges) == ("partly", [range(100, 120)])
+    assert survey.not_searched_from(found) == 15
 
 
 def test_a_device_that_never_answers_is_given_up() -> None:

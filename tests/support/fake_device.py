@@ -46,6 +46,22 @@ def registers(pdu: bytes, value: int = 0) -> bytes:
     return bytes([pdu[0], 2 * count]) + value.to_bytes(2) * count
 
 
+def whole_floats(code: int) -> Answer:
+    """A meter with 150 floats in its input registers that refuses to read a part of one."""
+
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 4:
+            return exception(pdu, 1)
+        if first % 2 or count % 2:
+            return exception(pdu, code)
+        if first + count > 300:
+            return exception(pdu, 2)
+        return bytes([4, 2 * count]) + struct.pack(">f", 230.2) * (count // 2)
+
+    return answers
+
+
 def good_unit() -> ServerModel:
     """A unit 1 as described above."""
     model = ServerModel(dict.fromkeys(AREAS, (0, 1000)))

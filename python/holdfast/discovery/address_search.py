@@ -13,6 +13,10 @@ Both begin where people look first: with the registers at `USUAL_STARTS`. Then c
 registers, and then coils and discrete inputs in the same way.
 
 If a block fails, but all its parts can be read, it was too large: blocks then stay smaller.
+
+Some devices refuse to read a part of a value. If no register of an area can be read alone, two and
+then four registers are read at some places. If such a read succeeds, the area is searched again in
+reads of that size; an address is then absent if the read that begins there returns exception 02.
 """
 
 from __future__ import annotations
@@ -30,6 +34,7 @@ from holdfast.protocol import (
     BUSY,
     ILLEGAL_ADDRESS,
     ILLEGAL_FUNCTION,
+    ILLEGAL_VALUE,
     LAST_ADDRESS,
     READ_LIMITS,
 )
@@ -75,6 +80,9 @@ in the hundred from 0: 40, 100: 21, 1000: 18, 200: 16, 5000: 14, 300, 500 and 33
 1000 in 7 each. Maps that count from 1 have 1, 1001, 30001 and 40001. SunSpec begins at 40000, 50000
 or 0. Other starts that are as frequent, such as 30513 and 30775, are those of a single vendor.
 """
+
+VALUE_WIDTHS = (2, 4)
+"""The numbers of registers to read together where none can be read alone."""
 
 CLOSER = (1, 2, 4, 8, 16, 32, 64)
 """Distances after the end of a range at which to search for the next range."""
@@ -296,7 +304,21 @@ class Survey:
     @property
     def absent_costs(self) -> int:
         """How many requests the search takes on a device without any address."""
-        return len(self.areas) * (len(self.span) if self.exact else len(self.samples))
+        alone = len(self.areas) * (len(self.span) if self.exact else len(self.samples))
+        return alone + sum(len(self.value_reads(found.area)) for found in self.areas)
+
+    def value_reads(self, area: Area) -> list[Probe]:
+        """The reads that show whether an area has values that can't be read in part."""
+        if area in BIT_AREAS:
+            return []
+        first = self.span if self.exact else self.samples
+        places = dict.fromkeys((*self.starts, *first[:FIRST_ADDRESSES:2]))
+        return [
+            Probe(area, place, width)
+            for width in VALUE_WIDTHS
+            for place in places
+            if width <= (self.max_quantity or width) and place + width <= self.span.stop
+        ]
 
     def steps(self) -> Steps[None]:
         """Yields the reads one by one; send the outcome of each."""
@@ -304,15 +326,24 @@ class Survey:
         yield from self._await_reply(every)
         bits = [search for search in every if search.area in BIT_AREAS]
         for searches in (every[: len(every) - len(bits)], bits):
-            for start in self.starts:
-                for search in searches:
-                    yield from search.sample(start)
-            for sample in self.span if self.exact else self.samples:
-                for search in searches:
-                    search.reached(sample)
-                    yield from search.sample(sample)
+            yield from self._in_order(searches)
+            again = []
+            for search in searches:
+                if (yield from search.finds_values()):
+                    again.append(search)
+            yield from self._in_order(again)
             for search in searches:
                 search.end()
+
+    def _in_order(self, searches: Sequence[_Search]) -> Steps[None]:
+        """Reads all samples: first the usual starts, then by address."""
+        for start in self.starts:
+            for search in searches:
+                yield from search.sample(start)
+        for sample in self.span if self.exact else self.samples:
+            for search in searches:
+                search.reached(sample)
+                yield from search.sample(sample)
 
     def _await_reply(self, searches: Sequence[_Search]) -> Steps[None]:
         """Reads the first sample of each area in turn until the device replies.
@@ -390,7 +421,10 @@ class _Search:
         self.area = found.area
         self._survey = survey
         self._found = found
+        self._width = 1
+        """The addresses that are read together: a count of a read is a multiple of it."""
         self._limit = min(limit, survey.max_quantity or limit)
+        """The largest read, in multiples of the width."""
         self._first = survey.span.start
         self._stop = survey.span.stop
         self._has_begun = False
@@ -420,6 +454,24 @@ class _Search:
             return
         yield from self._after(address, (yield from self._first_hit([address])))
 
+    def finds_values(self) -> Steps[bool]:
+        """Looks for values that can't be read in part, if no register could be read alone. Returns
+        whether there are any: the search then begins again, and reads them whole."""
+        found = self._found
+        if found.ranges or {ILLEGAL_ADDRESS, ILLEGAL_VALUE}.isdisjoint(self._refused.values()):
+            return False
+        for probe in self._survey.value_reads(self.area):
+            if (yield from self._survey.read(found, probe)) is None:
+                self._width = probe.count
+                self._limit //= probe.count
+                # That a register is refused alone does not show that it is absent.
+                self._refused.clear()
+                self._places.clear()
+                self._is_in_order = False
+                found.given_up, found.reached = None, self._first
+                return True
+        return False
+
     def reached(self, address: int) -> None:
         """Records that the area was searched below an address."""
         self._is_in_order = True
@@ -447,7 +499,7 @@ class _Search:
         """Reads the range around a hit, and ranges close behind it."""
         while hit is not None:
             size = yield from self._follow_back(hit - 1, self._floor(hit))
-            end = yield from self._follow(hit + 1, size)
+            end = yield from self._follow(hit + self._width, size)
             whole = self._found.range_of(hit)
             assert whole is not None
             self._survey.findings.append(Finding(self._found.area, whole))
@@ -474,7 +526,8 @@ class _Search:
     def _first_hit(self, addresses: Iterable[int]) -> Steps[int | None]:
         """The first existing address that was not found before."""
         for address in addresses:
-            if address >= self._stop or self._found.range_of(address) is not None:
+            is_known = self._found.range_of(address) is not None
+            if is_known or address + self._width > self._stop:
                 return None
             if address not in self._refused and (yield from self._read(address, 1)) is None:
                 return address
@@ -490,50 +543,55 @@ class _Search:
         that size. A range that was found before is not read again.
         """
         # The exact search reads every address: the hit was its block of 1.
-        pace = _Pace(self._limit, self._found, max(size, 2 if self._survey.exact else 1))
+        pace = self._pace(max(size, 2 if self._survey.exact else 1))
         following = self._found.range_of(at) or self._found.next_range(at)
         stop = self._stop if following is None else following.start
-        while at < stop:
-            count = min(pace.count, stop - at)
+        while (left := (stop - at) // self._width) > 0:
+            count = min(pace.count, left)
             if count == 1 and at in self._refused:
                 return at
             outcome = yield from self._read(at, count)
             if outcome is None:
-                at += count
+                at += count * self._width
                 if self._is_in_order:
                     self.reached(at)
             elif count == 1:
                 return at
             self._limit = pace.changed(count, outcome)
-        return at if following is None else following.stop
+        return at if following is None or at < stop else following.stop
 
     def _follow_back(self, at: int, floor: int) -> Steps[int]:
         """Reads from `at` down to the first address that fails, or to `floor`. Returns the size of
         the largest block that could be read."""
-        pace = _Pace(self._limit, self._found)
+        pace = self._pace(1)
         largest = 1
-        while at >= floor:
-            count = min(pace.count, at + 1 - floor)
-            outcome = yield from self._read(at + 1 - count, count)
+        while left := (at + 1 - floor) // self._width:
+            count = min(pace.count, left)
+            outcome = yield from self._read(at + 1 - count * self._width, count)
             if outcome is None:
-                at -= count
+                at -= count * self._width
                 largest = max(largest, count)
             elif count == 1:
                 break
             self._limit = pace.changed(count, outcome)
         return largest
 
+    def _pace(self, count: int) -> _Pace:
+        return _Pace(self._limit, self._found, count, self._width)
+
     def _read(self, address: int, count: int) -> Steps[Outcome]:
-        """Reads, and records the result for the addresses."""
-        outcome = yield from self._survey.read(self._found, Probe(self._found.area, address, count))
+        """Reads `count` times the width, and records the result for the addresses."""
+        probe = Probe(self.area, address, count * self._width)
+        outcome = yield from self._survey.read(self._found, probe)
         self._record(address, count, outcome)
         return outcome
 
     def _record(self, address: int, count: int, outcome: Outcome) -> None:
         if outcome is None:
-            self._found.largest = max(self._found.largest, count)
-            _add(self._found.ranges, address, count)
-            self._forget_failures(address, count)
+            registers = count * self._width
+            self._found.largest = max(self._found.largest, registers)
+            _add(self._found.ranges, address, registers)
+            self._forget_failures(address, registers)
         elif count == 1:
             self._refused[address] = outcome
             bisect.insort(self._places, address)
@@ -552,10 +610,11 @@ class _Pace:
     block was too large.
     """
 
-    def __init__(self, limit: int, found: AreaMap, count: int = 1) -> None:
+    def __init__(self, limit: int, found: AreaMap, count: int, width: int) -> None:
         self.limit = limit
         self.count = min(count, limit)
         self._found = found
+        self._width = width
         self._suspect: int | None = None
         """The number of next addresses of which at least one should be unreadable."""
 
@@ -571,7 +630,7 @@ class _Pace:
             self.count = max(1, self._suspect // 2)
         else:
             self._suspect = None
-            self.count = self.limit = min(self.limit, self._found.largest)
+            self.count = self.limit = min(self.limit, self._found.largest // self._width)
         return self.limit
 
 

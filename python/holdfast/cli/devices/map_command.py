@@ -68,6 +68,9 @@ def map_(
     to 65536 per area: minutes over TCP, hours on a serial line. --range and --areas limit the
     search.
 
+    If no register of an area answers alone, two and four registers are read at some places; if such
+    a read succeeds, the area is searched again in steps of that size.
+
     The registers at usual starts come first (0, 1, 100, 1000, …, 40000), then the other registers,
     then coils and discrete inputs. Each range is printed when its ends are known; with --json, as
     an element of "found".

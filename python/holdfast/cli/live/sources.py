@@ -11,6 +11,7 @@ from holdfast.cli import terminal_text
 from holdfast.cli.device_errors import hint, problem
 from holdfast.cli.options.device import read_raw
 from holdfast.cli.terminal_text import print_json
+from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -70,10 +71,13 @@ class DeviceSource:
 
     def read(self) -> list[list[int]]:
         """Reads the values of each block."""
-        return [
-            read_raw(self._client, block.area, block.address, block.count, unit=block.unit)
-            for block in self.blocks
-        ]
+        return [self._values(block) for block in self.blocks]
+
+    def _values(self, block: WatchedRange) -> list[int]:
+        # Some devices refuse to read a part of a value: a request ends at an even distance.
+        element = 1 if block.area in BIT_AREAS or block.count % 2 else 2
+        place = (block.area, block.address, block.count)
+        return read_raw(self._client, *place, element=element, unit=block.unit)
 
     def close(self) -> None:
         """Closes the connection."""
