@@ -171,6 +171,37 @@ def test_types_of_registers_take_more_bytes_of_coils_than_they_count(
     assert [tags[name]["address"] for name in ("a_7", "c_7", "d_7")] == [0, 40, 56]
 
 
+@pytest.mark.parametrize(
+    ("order", "expected", "left_out"),
+    [
+        ("BE_BE", "0000001111", ["late", "last"]),
+        ("BE_LE", "0000001111", ["late", "last"]),
+        ("LE_BE", "10000011100", ["late"]),
+        ("LE_LE", "10000011100", ["late"]),
+    ],
+)
+def test_one_bit_of_coils_is_that_of_two_bytes(
+    read: Callable[[str], Imported],
+    tmp_path: Path,
+    order: str,
+    expected: str,
+    left_out: list[str],
+) -> None:
+    found = read(
+        f"device,plant,1\npoll,coil,0,32,{order}\n"
+        "ref,a,0:14,bool,rw\nref,list,1,bool8,r\nref,late,2:0,bool,r\n"
+        f"poll,coil,0,32,{order}\nref,b,0:6,bool,r\n"
+        f"poll,coil,8,12,{order}\nref,last,8:0,bool,r\n"
+    )
+    assert "".join(str(int(each)) for each in values(tmp_path)) == expected
+    assert found.data["devices"]["plant"]["tags"]["a"]["writable"] is True
+    told = {
+        "late": "5: plant.late: left out: the reply ended before its byte; the source had no value",
+        "last": "9: plant.last: left out: not in its poll, coil 23; the source had false",
+    }
+    assert [each for each in notes(found) if "left out" in each] == [told[it] for it in left_out]
+
+
 def test_what_the_source_did_not_read_is_left_out(read: Callable[[str], Imported]) -> None:
     found = read(
         "# plant of 2024\n"

@@ -355,8 +355,8 @@ def _bit_tags(desk: Desk, poll: _Poll) -> Iterator[tuple[KeyPath, str, dict[str,
     """The tags of a poll of coils or discrete inputs.
 
     The source takes a byte of the reply after the other: an address behind the start of the poll
-    counts bytes, and begins later if the reference before it has taken that byte. A type of
-    registers takes more bytes than it counts.
+    counts bytes, and begins later if the reference before it has taken that byte. A single bit, as
+    a type of registers, takes more bytes than it counts.
     """
     at, byte = poll.start, 0
     for each in poll.references:
@@ -364,12 +364,23 @@ def _bit_tags(desk: Desk, poll: _Poll) -> Iterator[tuple[KeyPath, str, dict[str,
         at = max(at, each.address) + each.width
         first = poll.start + 8 * byte
         is_known = each.type in _WIDTHS | _LISTS or each.type.startswith("string")
-        byte += (each.width if each.type in _LISTS else 2 * each.width) if is_known else 0
-        if first + 8 * (each.width - 1) >= poll.end:
-            desk.left_out(each.path, "the reply ended before its byte; the source had no value")
-        elif each.type not in _LISTS:
+        is_list = each.type in _LISTS and each.bit is None
+        taken = (each.width if is_list else 2 * each.width) if is_known else 0
+        byte += taken
+        if each.type not in _LISTS:
             message = f"{show(each.type)} is no type of coils here, allowed: bool, bool8, bool16"
             desk.left_out(each.path, message)
+        elif first + 8 * (taken - 1) >= poll.end:
+            desk.left_out(each.path, "the reply ended before its byte; the source had no value")
+        elif each.bit is not None:
+            # A bit of a number with 16 bits, whose first coil is the highest bit.
+            bit = each.bit ^ 8 if poll.order in SWAPPED_BYTES else each.bit
+            coil = first + 15 - bit
+            if coil < poll.end:
+                place = {"area": poll.area, "address": coil, "type": "bool"}
+                yield each.path, each.name, {**place, **each.settings}
+            else:
+                desk.left_out(each.path, f"not in its poll, coil {coil}; the source had false")
         else:
             # Each byte has its last coil first.
             coils = (first + 8 * byte + 7 - bit for byte in range(each.width) for bit in range(8))
