@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from holdfast.cli import main
 from holdfast.config import load
 from holdfast.importing import NotImportable, read_home_assistant
-from holdfast.values import decode
+from holdfast.values import decode, register_count
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -133,7 +133,6 @@ def test_each_type_and_order_has_the_value_that_the_source_had(
         ("!d", 4, "float64", None),
         ("<i", 2, "int32", "DCBA"),
         ("h", 1, "int16", "DCBA"),
-        (">3H", 3, "uint16[3]", None),
         (">l", 2, "int32", None),
         ("@L", 4, "uint64", "DCBA"),
         (">8s", 4, "string:8", None),
@@ -145,6 +144,32 @@ def test_a_structure_of_one_kind_is_a_type(
     entity = f"name: x, address: 1, data_type: custom, structure: '{structure}', count: {count}"
     tag = tags(imported(f"sensors: [{{{entity}}}]"))["x"]
     assert (tag["type"], tag.get("order")) == (kind, order)
+
+
+@pytest.mark.parametrize(
+    ("structure", "swap"), [(">3H", "none"), ("<2i", "none"), (">2f", "none"), (">2h", "byte")]
+)
+def test_each_value_of_a_structure_is_a_sensor(
+    imported: Callable[..., Imported], structure: str, swap: str
+) -> None:
+    data = bytes(range(0x41, 0x41 + struct.calcsize(structure)))
+    registers = [int.from_bytes(data[at : at + 2], "big") for at in range(0, len(data), 2)]
+    received = [int.from_bytes(each.to_bytes(2, "big"), "little") for each in registers]
+    swapped = b"".join(each.to_bytes(2, "big") for each in received)
+    expected = struct.unpack(structure, swapped if swap == "byte" else data)
+    found = imported(
+        f"sensors: [{{name: x, address: 20, data_type: custom, structure: '{structure}', "
+        f"count: {len(registers)}, swap: {swap}, unit_of_measurement: V, nan_value: 7}}]"
+    )
+    values = []
+    for tag in tags(found).values():
+        assert (tag["unit"], 7 in tag["null"]) == ("V", True)
+        of_tag = registers[tag["address"] - 20 :][: register_count(tag["type"])]
+        values.append(decode(of_tag, tag["type"], tag.get("order", "ABCD")))
+    assert tuple(values) == expected
+    assert list(tags(found)) == ["x", "x_1", "x_2"][: len(expected)]
+    message = "changed: a sensor for each value; the source had one text"
+    assert f"8: modbus[0].sensors[0]: {message}" in notes(found)
 
 
 def test_a_structure_of_several_kinds_is_left_out(imported: Callable[..., Imported]) -> None:

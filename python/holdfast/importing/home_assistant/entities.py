@@ -13,6 +13,7 @@ from holdfast.importing.names import MAX_LENGTH, free_name
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.values import encode, register_count
 from holdfast.values.errors import DoesNotFit
+from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from holdfast.config.text.yaml_document import KeyPath
@@ -113,11 +114,15 @@ def _sensor(places: Places, entity: Section) -> None:
         for key in [key for key, value in scaled.items() if value is not None]:
             entity.desk.left_out(entity.at(key), "a text has none")
             scaled[key] = None
-    settings |= scaled
+    found = parsed(settings["type"])
+    if found.count is not None:
+        message = "a sensor for each value; the source had one text"
+        entity.desk.changed(entity.path, message)
+    settings |= {"type": found.element, **scaled}
     settings["unit"] = entity.text("unit_of_measurement")
-    settings["null"] = _null(entity, settings["type"])
-    size = register_count(settings["type"])
-    for index in range(_copies(entity) + 1):
+    settings["null"] = _null(entity, found.element)
+    size = register_count(found.element)
+    for index in range((_copies(entity) + 1) * (found.count or 1)):
         name = f"{_name(entity)} {index}" if index else _name(entity)
         places.add(name, area, address + index * size, **_given(settings))
 
