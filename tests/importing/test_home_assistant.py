@@ -327,12 +327,17 @@ def test_covers_and_climates_become_their_registers(imported: Callable[..., Impo
         "    climates: [{name: Hall, address: 30, input_type: input, scale: 0.1, "
         "target_temp_register: [31, 31, 31, 31, 31, 31, 31], max_temp: 28, "
         "hvac_onoff_coil: 7, "
-        "hvac_mode_register: {address: 32, values: {state_off: 0, state_fan_only: [2, 3]}}, "
+        "hvac_mode_register: {address: 32, values: {state_off: 0}}, "
         "fan_mode_register: {address: 33, values: {state_fan_low: 1, state_fan_high: 2}}}]"
     )
     found_tags = tags(found)
-    states = {0: "closed", 2: "opening", 3: "closing", 5: "open"}
-    assert found_tags["gate"]["states"] == found_tags["gate_status"]["states"] == states
+    assert found_tags["gate"]["states"] == {0: "closed", 5: "open"}
+    assert found_tags["gate_status"] == {
+        "area": "input_registers",
+        "address": 21,
+        "states": {0: "closed", 2: "opening", 3: "closing", 5: "open"},
+        "description": "Gate status",
+    }
     assert found_tags["hall"] == {
         "area": "input_registers",
         "address": 30,
@@ -344,9 +349,44 @@ def test_covers_and_climates_become_their_registers(imported: Callable[..., Impo
     setpoint = found_tags["hall_setpoint"]
     assert (setpoint["area"], setpoint["address"]) == ("holding_registers", 31)
     assert (setpoint["min"], setpoint["max"], setpoint["scale"]) == (5, 28, 0.1)
-    assert found_tags["hall_mode"]["states"] == {0: "off", 2: "fan_only", 3: "fan_only (3)"}
     assert found_tags["hall_fan_mode"]["states"] == {1: "low", 2: "high"}
+    assert "hall_fan_mode_state" not in found_tags
     assert found_tags["hall_power"]["area"] == "coils"
+
+
+def test_only_numbers_that_the_source_wrote_can_be_written(
+    imported: Callable[..., Imported],
+) -> None:
+    found = imported(
+        "covers: [{name: gate, address: 20}, {name: flap, address: 3, input_type: coil}]\n"
+        "    climates: [{name: hall, address: 30, target_temp_register: 31, hvac_mode_register: "
+        "{address: 32, values: {state_off: 0, state_heat: 1, state_cool: [3, 2], "
+        "state_fan_only: [1, 4]}}}]"
+    )
+    states = {
+        name: (tag["address"], tag.get("writable", False), tag["states"])
+        for name, tag in tags(found).items()
+        if "states" in tag
+    }
+    assert states == {
+        "gate": (20, True, {0: "closed", 1: "open"}),
+        "gate_status": (20, False, {0: "closed", 1: "open", 2: "opening", 3: "closing"}),
+        "hall_mode": (32, True, {0: "off", 1: "heat", 3: "cool"}),
+        "hall_mode_state": (
+            32,
+            False,
+            {0: "off", 1: "heat", 2: "cool (2)", 3: "cool", 4: "fan_only"},
+        ),
+    }
+    assert tags(found)["flap"] == {"area": "coils", "address": 3, "writable": True}
+    covers, mode = "modbus[0].covers", "modbus[0].climates[0].hvac_mode_register"
+    firsts = "the select has the first number of each mode, which the source wrote"
+    assert {
+        f"8: {covers}[0]: changed: a select and a sensor instead of a cover",
+        f"8: {covers}[1]: changed: a switch instead of a cover",
+        f"9: {mode}: changed: {firsts}; a sensor has all",
+        f"9: {mode}.values.state_fan_only: left out: fan_only is 1, as heat",
+    } <= set(notes(found))
 
 
 def test_a_number_with_several_names_has_the_first_of_the_source(
@@ -359,7 +399,7 @@ def test_a_number_with_several_names_has_the_first_of_the_source(
         "hvac_action_register: {address: 33, values: {action_off: 0, action_idle: 0}}}]"
     )
     found_tags = tags(found)
-    assert found_tags["gate"]["states"] == {0: "closed", 1: "open", 3: "closing"}
+    assert found_tags["gate_status"]["states"] == {0: "closed", 1: "open", 3: "closing"}
     assert found_tags["hall_mode"]["states"] == {0: "off", 1: "heat"}
     assert found_tags["hall_action"]["states"] == {0: "idle"}
     assert [note.partition(": left out: ")[2] for note in notes(found) if "left out" in note] == [

@@ -350,23 +350,26 @@ def _cover(places: Places, entity: Section) -> None:
     """A coil, or a register with the numbers of open and closed."""
     area = _area(entity, "input_type", "holding", ("holding", "coil"))
     address = _address(entity)
-    # closed and open are first: the source wrote them.
+    # closed and open are first: the source wrote them, and only them.
     defaults = {"closed": 0, "open": 1, "opening": 2, "closing": 3}
     numbers = [
         (_register(entity, f"state_{name}", usual), name, entity.at(f"state_{name}"))
         for name, usual in defaults.items()
     ]
-    states = _states(entity.desk, numbers)
     status = _address(entity, "status_register", required=False)
     status_area = _area(entity, "status_register_type", "holding", _REGISTERS)
     if address is None:
         return
+    if status is None and area not in _BITS:
+        status_area, status = area, address
     kind = "switch" if area in _BITS else "select"
-    entity.desk.changed(entity.path, f"a {kind} instead of a cover")
+    more = "" if status is None else " and a sensor"
+    entity.desk.changed(entity.path, f"a {kind}{more} instead of a cover")
     places.written[False].append(entity.path)
-    settings = {} if area in _BITS else states
+    settings = {} if area in _BITS else _states(entity.desk, numbers[:2])
     places.add(_name(entity), area, address, **settings, writable=True)
     if status is not None:
+        states = _states(entity.desk, numbers)
         places.add(f"{_name(entity)} status", status_area, status, **states)
 
 
@@ -435,12 +438,22 @@ def _mode(places: Places, entity: Section, key: str, *, writable: bool) -> None:
         return
     names = [(_PREFIX.sub("", str(key)), key) for key in values.data]
     names.sort(key=lambda each: _SEARCHED.index(each[0]) if each[0] in _SEARCHED else 99)
-    found = [(each, name, values.at(key)) for name, key in names for each in _numbers(values, key)]
-    settings = _states(entity.desk, found)
-    if writable:
-        settings["writable"] = True
-    title = key.removesuffix("_register").removeprefix("hvac_").replace("_", " ")
-    places.add(f"{_name(entity)} {title}", area, given[0], **settings)
+    found = [(_numbers(values, key), name, values.at(key)) for name, key in names]
+    read = _states(
+        entity.desk, ((number, name, path) for numbers, name, path in found for number in numbers)
+    )
+    kind = key.removesuffix("_register").removeprefix("hvac_").replace("_", " ")
+    title = f"{_name(entity)} {kind}"
+    if not writable:
+        places.add(title, area, given[0], **read)
+        return
+    firsts = ((numbers[0], name, path) for numbers, name, path in found if numbers)
+    written = _states(entity.desk, firsts)
+    places.add(title, area, given[0], **written, writable=True)
+    if read != written:
+        message = "the select has the first number of each mode, which the source wrote"
+        entity.desk.changed(register.path, f"{message}; a sensor has all")
+        places.add(f"{title} state", area, given[0], **read)
 
 
 def _power(places: Places, entity: Section) -> None:
