@@ -221,6 +221,19 @@ def test_the_first_write_that_does_not_fit_is_refused_and_changes_nothing(
     assert verify([log]).error is None
 
 
+def test_the_record_of_a_write_that_failed_halfway_waits_for_room(
+    access: Callable[[str], tuple[Appliance, MemoryAccess]],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, rest = access(CLOSED)
+    make_room = full(monkeypatch)
+    rest.refuse(Refused("internal_error", "see the log"), "gateway", "127.0.0.1:9")
+    make_room()
+    [line] = await_writes(tmp_path / "audit.log", 1)
+    assert line["outcome"] == "internal_error"
+
+
 def test_writes_that_are_refused_anyway_are_not_recorded_as_done(
     access: Callable[[str], tuple[Appliance, MemoryAccess]], tmp_path: Path
 ) -> None:

@@ -16,10 +16,11 @@ import pytest
 
 import holdfast
 from holdfast.adapters.rest.device_writes import MAX_WAITING, DeviceWrites
-from holdfast.ingest import Grant, MemoryAccess
+from holdfast.events.audit import Audit
+from holdfast.ingest import Grant, MemoryAccess, Refused
 from holdfast.net.http.requests import Request
 from support import web, wire
-from support.audits import writes
+from support.audits import await_writes, full, writes
 from support.cli import RunCommand
 from support.config_folder import written
 from support.fake_device import Asked, Stream, exception, good
@@ -520,7 +521,7 @@ def test_a_silent_device_holds_up_no_other_write_of_rest(run: Run) -> None:
         assert {answer(each).status for each in waiting} == {200}
 
 
-def test_a_write_whose_answer_nobody_waited_for_is_recorded() -> None:
+def test_a_write_whose_answer_nobody_waited_for_is_recorded(tmp_path: Path) -> None:
     """The device answers later than REST ends."""
 
     class Passage:
@@ -548,12 +549,17 @@ def test_a_write_whose_answer_nobody_waited_for_is_recorded() -> None:
 
     plant, passage = holdfast.Memory(holding_registers=8), Passage()
     plant.mirror([("holding_registers", 0, 8)])
-    memory_access = MemoryAccess("rest", {"plant": plant}, passages=cast("Any", {"plant": passage}))
+    audit = Audit(tmp_path / "audit.jsonl", max_bytes=65536, keep=1)
+    passages = cast("Any", {"plant": passage})
+    memory_access = MemoryAccess("rest", {"plant": plant}, audit, passages)
     grant = Grant("edge", ["plant"], ["holding_registers"])
     body = json.dumps(web.command("holding_registers", 0, [7], "plant")).encode()
     begun = memory_access.begin(body, grant, "127.0.0.1:50000")
     asyncio.run(cancelled())
     assert memory_access.counts()["refused"] == {"device_refused": 1}
+    [line] = writes(tmp_path / "audit.jsonl")
+    assert (line["route"], line["values"]) == ("drive", [7])
+    assert line["outcome"] == "gateway_target_device_failed_to_respond"
 
 
 def test_a_write_that_memory_could_not_keep_is_not_confirmed(tmp_path: Path) -> None:
@@ -604,15 +610,79 @@ def test_a_full_disk_keeps_closed_audit_logs_from_passing_writes_on(
         assert any(asked.pdu[0] in (6, 16) for asked in source.requests) == (fail == "open")
 
 
-def test_the_audit_log_names_the_device(run: Run, tmp_path: Path) -> None:
+def write_as_mqtt(appliance: Appliance, command: dict[str, object]) -> None:
+    """Writes as MQTT does: unlike REST, it waits for the device in its own thread."""
+    parts = appliance._parts()
+    access = MemoryAccess("mqtt", appliance.memories, parts.audit.log, parts.devices.passages)
+    grant = Grant("edge", ["mirror"], ["holding_registers"])
+    access.ingest(json.dumps(command).encode(), grant, "127.0.0.1:9")
+
+
+@pytest.mark.parametrize("over", ["modbus", "rest", "mqtt"])
+def test_the_audit_log_has_what_was_sent_to_the_device_and_its_answer(
+    over: str, run: Run, tmp_path: Path
+) -> None:
+    """It differs between a write that the device has refused and one that it may carry out."""
+
+    def refuse(asked: Asked) -> None:
+        code = asked.pdu[-1]
+        asked.answer(exception(asked.pdu, code) if asked.pdu[0] > 4 and code else None)
+
+    outcomes = {
+        0: "done",
+        2: "illegal_data_address",
+        11: "gateway_target_device_failed_to_respond",
+        0x5A: "exception_5a",
+    }
     log = tmp_path / "audit.jsonl"
-    with plc() as source:
+    with plc(refuse) as source, contextlib.ExitStack() as stack:
         meter = device(source.url, *READS, **RARELY)
         appliance = run(configuration({"meter": meter}, **MORE, audit={"file": str(log)}))
         until_read(appliance)
-        with client(appliance) as scada:
-            scada.write_register(11, 7)
+        scada = stack.enter_context(client(appliance))
+        rest = stack.enter_context(contextlib.closing(web.Client(endpoint(appliance, "rest"))))
+        for code in outcomes:
+            command = web.command("holding_registers", 11, [code], "mirror")
+            if over == "rest":
+                assert rest.ingest(command).status == (502 if code else 200)
+            else:
+                with contextlib.suppress(holdfast.ModbusException, Refused):
+                    if over == "modbus":
+                        scada.write_register(11, code)
+                    else:
+                        write_as_mqtt(appliance, command)
         appliance.stop()
-    (line,) = writes(log)
-    told = [line[key] for key in ("route", "unit", "address", "outcome")]
-    assert told == ["meter", 1, 11, "done"]
+    told = [
+        [line[key] for key in ("route", "address", "values", "outcome")] for line in writes(log)
+    ]
+    assert told == [["meter", 11, [code], outcome] for code, outcome in outcomes.items()]
+
+
+@pytest.mark.parametrize("over", ["rest", "mqtt"])
+def test_a_write_that_a_device_may_have_carried_out_is_recorded_when_the_disk_has_room(
+    over: str, run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("holdfast.appliance.parts.audit.RETRY_S", 0.01)
+    log = tmp_path / "audit.jsonl"
+
+    def silent(asked: Asked) -> None:
+        asked.answer(exception(asked.pdu, 11) if asked.pdu[0] > 4 else None)
+
+    with plc(silent) as source:
+        meter = device(source.url, *READS, **RARELY)
+        audit = {"file": str(log), "fail": "closed"}
+        appliance = run(configuration({"meter": meter}, **MORE, audit=audit))
+        until_read(appliance)
+        command = web.command("holding_registers", 10, [7], "mirror")
+        make_room = full(monkeypatch)
+        if over == "rest":
+            with contextlib.closing(web.Client(endpoint(appliance, "rest"))) as rest:
+                assert rest.ingest(command).json["reason"] == "device_refused"
+        else:
+            with pytest.raises(Refused, match="may still be carried out"):
+                write_as_mqtt(appliance, command)
+        assert writes(log) == []
+        make_room()
+        [line] = await_writes(log, 1)
+    assert (line["route"], line["values"]) == ("meter", [7])
+    assert line["outcome"] == "gateway_target_device_failed_to_respond"

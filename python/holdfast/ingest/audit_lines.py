@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.events.audit.chain import encoded
+from holdfast.protocol import EXCEPTIONS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -25,8 +26,8 @@ class Recording:
     """Records commands that are carried out together.
 
     Their lines are written before memory is, together with those of other commands that have begun.
-    What a journal carries out, and what is written only while memory is sealed, is recorded after
-    it: only then the outcome is known, and the sequence in a log.
+    What a journal or a device carries out, and what is written only while memory is sealed, is
+    recorded after it: only then the outcome is known, and the sequence in a log.
     """
 
     __slots__ = ("_audit", "_group", "_memories", "_origin", "_writes")
@@ -63,9 +64,21 @@ class Recording:
         """Nobody knows whether the commands will be carried out."""
         self._audit.write_all(self._lines("not_confirmed"), done=True)
 
-    def _lines(self, outcome: str, sequence: int | None = None) -> list[msgspec.Raw]:
+    def answered(self, device: str, code: int | None) -> None:
+        """A device was sent the commands in place of memory, and answered with this exception, if
+        any. The outcome is named as that of the same write over Modbus.
+        """
+        outcome = "done"
+        if code is not None:
+            outcome = EXCEPTIONS.get(code, f"exception {code:02x}").lower().replace(" ", "_")
+        route = b"," + encoded({"route": device})[1:-1]
+        self._audit.write_all(self._lines(outcome, route=route), done=True)
+
+    def _lines(
+        self, outcome: str, sequence: int | None = None, *, route: bytes = b""
+    ) -> list[msgspec.Raw]:
         names = [encoded(name) for name in self._memories]
-        lines = self._writes.lines(self._origin, names, outcome, sequence)
+        lines = self._writes.lines(self._origin + route, names, outcome, sequence)
         return [msgspec.Raw(line) for line in lines]
 
 

@@ -25,7 +25,6 @@ from holdfast.ingest.audit_lines import Recording, origin_around, values_of
 from holdfast.ingest.counts import Counts
 from holdfast.ingest.refusals import (
     KEEPING,
-    UNCERTAIN,
     Refused,
     malformed,
     place_of,
@@ -192,15 +191,18 @@ class MemoryAccess:
 
     def answered(self, begun: Begun, code: int | None) -> Written:
         """Takes the answer of the device: the code of its exception, if any. Raises `Refused`."""
+        assert begun.device is not None
+        if begun.recording is not None:
+            begun.recording.answered(begun.device, code)
         if code is None:
-            if begun.recording is not None:
-                begun.recording.done()
             return self._accepted(begun, len(values_of(begun.batch[0])))
         name = EXCEPTIONS.get(code, "unknown")
         detail = f"{begun.device} did not take the write: exception {code:02X} ({name})"
         if code not in NOT_EXECUTED:
             detail += "; it may still be carried out, or have been"
-        raise Refused("device_refused", detail, **begun.where)
+        refused = Refused("device_refused", detail, **begun.where)
+        refused.is_recorded = True
+        raise refused
 
     def commands(self, grant: Grant, most: int) -> _core.Commands:
         """Parses commands of at most `most` bytes, for `begin_parsed`.
@@ -277,15 +279,18 @@ class MemoryAccess:
         by_nobody = refused.reason == "unauthorized"
         self._note(refused, who, peer, observed=by_nobody, throttle=throttle)
         if self._audit is not None and not refused.is_recorded and not by_nobody:
-            write = self._audit.write if refused.reason in UNCERTAIN else self._audit.write_refused
-            write(
-                listener=self.name,
-                peer=peer,
-                source=who,
-                function="write",
+            line = {
+                "listener": self.name,
+                "peer": peer,
+                "source": who,
+                "function": "write",
                 **refused.where,
-                outcome=refused.reason,
-            )
+                "outcome": refused.reason,
+            }
+            if refused.reason == "internal_error":  # The write may have been carried out.
+                self._audit.write_all([line], done=True)
+            else:
+                self._audit.write_refused(**line)
 
     def note(self, refused: Refused, who: str, peer: str) -> None:
         """Logs and counts a refusal without a line of its own in the audit log, as of a read."""

@@ -49,12 +49,6 @@ KEEPING = {
 }
 """Why memories that are kept refuse writes for now: a later attempt may succeed."""
 
-UNCERTAIN = ("device_refused", "internal_error")
-"""Reasons of writes that may have been carried out.
-
-Without `not_confirmed`, which `MemoryAccess` records itself.
-"""
-
 
 def unreadable(error: OSError) -> str:
     """The reason why a memory can't be read."""

@@ -7,6 +7,7 @@ that was sent is waited for, and recorded with the answer of the device.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections import Counter
 from functools import partial
 from typing import TYPE_CHECKING
@@ -74,12 +75,10 @@ class DeviceWrites:
             sent, result = await answer
         except asyncio.CancelledError:
             # Nobody waits for the answer any more: the record of the write must say so.
-            refused = _withdrawn(begun)
-            if calls.caller.withdraw(ticket):
-                detail = f"REST has ended before the answer of {begun.device}"
-                detail += "; the write may still be carried out, or have been"
-                refused = Refused("device_refused", detail, **begun.where)
-            self._memory_access.refuse(refused, begun.grant.name, begun.peer)
+            with contextlib.suppress(Refused), self._memory_access.refusing(begun):
+                if not calls.caller.withdraw(ticket):
+                    raise _withdrawn(begun) from None
+                self._memory_access.answered(begun, TARGET_SILENT)
             raise
         finally:
             request.when_gone(None)
