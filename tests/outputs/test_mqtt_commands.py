@@ -15,10 +15,12 @@ from holdfast.appliance import Appliance
 from holdfast.appliance.parts import tag_writes
 from holdfast.appliance.parts.tag_writes import TagWrites
 from holdfast.appliance.services.outputs import _Site
+from holdfast.events.audit.refusal_summaries import WHOLE_WRITES
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt import commands
 from holdfast.runtime.standstill import STANDSTILL_S
 from support import wire
+from support.audits import await_writes, full, lines, writes
 from support.mqtt_plant import TAGS, Client, Plant
 
 if TYPE_CHECKING:
@@ -192,8 +194,7 @@ def test_writes_are_in_the_audit_log(plant: Plant, tmp_path: Path) -> None:
         probe.publish("plant/pump/temperature/set", text)
         reply(probe, "temperature")
     plant.stop()
-    lines = [json.loads(line) for line in (tmp_path / "audit.log").read_text().splitlines()]
-    written = [line for line in lines if line.get("function") == "write"]
+    written = [line for line in lines(tmp_path / "audit.log") if line.get("function") == "write"]
     assert [line["outcome"] for line in written] == ["done", "invalid_value"]
     first = written[0]
     assert (first["listener"], first["device"], first["tag"]) == (
@@ -203,6 +204,42 @@ def test_writes_are_in_the_audit_log(plant: Plant, tmp_path: Path) -> None:
     )
     assert (first["area"], first["address"], first["values"]) == ("holding_registers", 0, [215])
     assert first["peer"].endswith("plant/pump/temperature/set")
+
+
+def test_refused_commands_do_not_fill_the_audit_log(plant: Plant) -> None:
+    plant.device()
+    probe = plant.probe("plant/#")
+    plant.appliance = Appliance(plant.config({"writes": True}, audit={"file": "audit.log"}))
+    plant.appliance.start()
+    probe.until("plant/holdfast/status/pump", "online")
+    for _ in range(WHOLE_WRITES + 5):
+        probe.publish("plant/pump/temperature/set", "99")
+        assert reply(probe, "temperature")["reason"] == "invalid_value"
+    plant.stop()
+    found = lines(plant.folder / "audit.log")
+    assert sum(line.get("function") == "write" for line in found) == WHOLE_WRITES
+    [summary] = [line for line in found if line.get("event") == "refused_write"]
+    told = [summary[key] for key in ("listener", "outcome", "peer", "count")]
+    assert told == ["output/home", "invalid_value", "127.0.0.1", 5]
+
+
+def test_a_command_that_may_be_carried_out_is_recorded_when_the_disk_has_room(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("holdfast.appliance.parts.audit.RETRY_S", 0.01)
+    device, probe = plant.slow_device(), plant.probe("plant/#")
+    audit = {"file": "audit.log", "fail": "closed"}
+    plant.appliance = Appliance(plant.config({"writes": True}, audit=audit)).start()
+    probe.until("plant/holdfast/status/pump", "online")
+    make_room = full(monkeypatch)
+    device.close()
+    probe.publish("plant/pump/temperature/set", "21.5")
+    assert reply(probe, "temperature")["status"] == "rejected"
+    log = plant.folder / "audit.log"
+    assert writes(log) == []
+    make_room()
+    [line] = await_writes(log, 1)
+    assert (line["device"], line["tag"], line["values"]) == ("pump", "temperature", [215])
 
 
 def followed_by(event: threading.Event, call: Callable[..., None]) -> Callable[..., None]:
@@ -230,9 +267,8 @@ class Held:
 
     def outcomes(self) -> list[str]:
         """Those of the audit log."""
-        with (self.plant.folder / "audit.log").open() as file:
-            lines = [json.loads(line) for line in file]
-        return [line["outcome"] for line in lines if line.get("function") == "write"]
+        found = lines(self.plant.folder / "audit.log")
+        return [line["outcome"] for line in found if line.get("function") == "write"]
 
 
 def test_the_stop_waits_for_a_write_and_refuses_others(

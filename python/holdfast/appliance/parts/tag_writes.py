@@ -82,7 +82,7 @@ class TagWrites:
             self._send(device, request, _Write(record, done))
         except NotWritten as refused:
             if self._audit is not None:
-                self._audit.write(**record, outcome=refused.reason)
+                self._audit.write_refused(**record, outcome=refused.reason)
             raise
 
     def stop(self) -> None:
@@ -147,7 +147,8 @@ class TagWrites:
         outcome = "done" if refused is None else refused.reason
         try:
             if self._audit is not None:
-                self._audit.write_all([{**write.record, "outcome": outcome}], done=refused is None)
+                # Whatever the outcome, the device may have carried out the write.
+                self._audit.write_all([{**write.record, "outcome": outcome}], done=True)
             write.done(refused)
         except Exception:  # A fault in one outcome must not end all others.
             log_lines.problem("tag_write_failed")
