@@ -207,30 +207,26 @@ READ_AND_WRITE = READ + bytes.fromhex("0000 01 0600011234 0000")
 
 
 @pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
-def test_a_read_only_rule_passes_on_nothing_behind_a_read(
-    kind: str, run: Run, connect: Connect, tmp_path: Path
+@pytest.mark.parametrize(
+    "rule", [{"access": "read-only"}, {"functions": [3, 6, 8, 16]}], ids=["read-only", "functions"]
+)
+def test_what_a_line_could_take_for_several_requests_is_not_sent(
+    rule: dict[str, Any], kind: str, run: Run, connect: Connect, tmp_path: Path
 ) -> None:
+    """Also over TCP: a gateway may be in between."""
+    echo_and_write = bytes.fromhex("08 0000 a537 0000 01 0600011234 0000")
     with Stream(kind) as device:
-        rule = {"access": "read-only"}
         text = configuration(device.url, rule=rule, audit={"file": "audit.log"})
         front = connect(scada(run(text)))
-        for request in (READ_AND_WRITE, bytes.fromhex("08 0000 a537 0000 01 0600011234 0000")):
-            assert front.ask(request) == exception(request, 1)
+        for request in (READ_AND_WRITE, echo_and_write, READ[:-1]):
+            assert front.ask(request) == exception(request, 3)
+        if "functions" in rule:
+            for request in (WRITE[:-1], WRITE + b"\0", bytes.fromhex("100001000102")):
+                assert front.ask(request) == exception(request, 3)
         assert front.ask(READ) == FIVE
         assert [asked.pdu for asked in device.requests] == [READ]
         [line, *_] = await_writes(tmp_path / "audit.log", 1)
-    assert (line["function"], line["outcome"]) == (3, "illegal_function")
-
-
-def test_what_a_line_would_take_for_several_requests_is_not_sent(
-    run: Run, connect: Connect
-) -> None:
-    with Stream("rtu+tcp") as device:
-        front = connect(scada(run(configuration(device.url))))
-        for request in (READ_AND_WRITE, WRITE[:-1], bytes.fromhex("100001000102")):
-            assert front.ask(request) == exception(request, 3)
-        assert front.ask(READ) == FIVE
-        assert [asked.pdu for asked in device.requests] == [READ]
+    assert (line["function"], line["outcome"]) == (3, "illegal_data_value")
 
 
 def test_a_route_to_a_device_sends_its_unit_id_and_a_link_keeps_that_of_the_request(

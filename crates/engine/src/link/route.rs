@@ -7,7 +7,6 @@ use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 
 use holdfast_protocol::client::Tolerance;
-use holdfast_protocol::frame::rtu_stream::is_one_request;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
 use holdfast_runtime::{Retry, lock};
 use tokio::sync::mpsc;
@@ -83,7 +82,6 @@ pub struct SharedLink {
     error: Mutex<Option<Arc<ClientError>>>,
     preferred: Vec<IpAddr>,
     tolerance: Tolerance,
-    has_rtu_frames: bool,
     /// In nanoseconds; 0 for no limit.
     longest_wait: AtomicU64,
 }
@@ -143,7 +141,6 @@ impl SharedLink {
             error: Mutex::default(),
             preferred: settings.preferred.clone(),
             tolerance: settings.endpoint.tolerance,
-            has_rtu_frames: settings.endpoint.place.transport().has_rtu_frames(),
             longest_wait: AtomicU64::new(0),
         }
     }
@@ -225,8 +222,7 @@ impl Route {
     /// Sends a request on its way, unchanged.
     ///
     /// # Errors
-    /// The exception to refuse it with: the queue is full, the link has ended, or devices on its line
-    /// would take it for several requests, perhaps to other units.
+    /// The exception to refuse it with: the queue is full, or the link has ended.
     pub(crate) fn ask(
         &self,
         asker: &Asker,
@@ -236,9 +232,6 @@ impl Route {
         let link = &self.link;
         link.counters.requests.add();
         let request = EncodedRequest::opaque(pdu).ok_or(ExceptionCode::IllegalFunction)?;
-        if link.has_rtu_frames && !is_one_request(pdu) {
-            return Err(ExceptionCode::IllegalDataValue);
-        }
         let place = link.admitted(link.queue.place(Source::client(asker.peer)));
         let place = place.ok_or(ExceptionCode::ServerDeviceBusy)?;
         let priority = Priority::of(&request, asker.peer, &link.preferred);

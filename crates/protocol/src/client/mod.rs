@@ -85,13 +85,6 @@ pub enum Transport {
     },
 }
 
-impl Transport {
-    /// Whether only the CRC, the length or a silence ends a frame.
-    pub const fn has_rtu_frames(self) -> bool {
-        matches!(self, Transport::RtuOverTcp | Transport::RtuOverUdp | Transport::SerialRtu { .. })
-    }
-}
-
 /// Why a request failed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[non_exhaustive]

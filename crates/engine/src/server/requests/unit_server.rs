@@ -11,6 +11,7 @@
 use std::sync::Arc;
 
 use holdfast_memory::{Access, Area, Memory, Read, Write};
+use holdfast_protocol::frame::rtu_stream::is_one_request;
 use holdfast_protocol::pdu::{
     self, Buffer, Diagnostics, ExceptionCode, Function, Range, Request, SubFunction, reply,
 };
@@ -196,6 +197,11 @@ impl UnitServer {
         self.comm_events.receive(Received::Request { silent: false });
         let sent = match place {
             _ if !rights.allows(unit_id, function_code) => Err(NOT_ALLOWED),
+            // A gateway may put it on a line, whose devices could read it as several requests: with
+            // functions, and for units, that the peer may not use.
+            Elsewhere::Device(_) if !is_one_request(request) => {
+                Err(ExceptionCode::IllegalDataValue)
+            }
             Elsewhere::Device(_) if rights.denies(unit_id, request) => Err(NOT_ALLOWED),
             Elsewhere::Mirror(passage) if outside(rights, unit_id, request) => {
                 Err(out_of_ranges(&passage.memory))
