@@ -185,6 +185,7 @@ class Memory:
 
     `seal` is the gate bit, in coils or discrete inputs. Modbus clients receive exception 06 until a
     write other than by Modbus sets that bit to 1: permanently (`once`), or while it is 1 (`level`).
+    `name` is its name in the audit log.
 
     Raises `ValueError` for an invalid size or gate bit.
     """
@@ -198,6 +199,7 @@ class Memory:
         input_registers: Extent | None = None,
         files: Mapping[int, int] | None = None,
         seal: Seal | None = None,
+        name: str | None = None,
     ) -> Memory: ...
     @property
     def areas(self) -> dict[Area, range]:

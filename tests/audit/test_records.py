@@ -73,7 +73,7 @@ def test_modbus_writes_are_audited_with_their_values(
     ):
         client.ask(bytes.fromhex(pdu))
     assert client.ask(bytes.fromhex("0600010001"), unit=9)[0] == 0x86
-    scada = {"listener": "scada", "unit": 1}
+    scada = {"listener": "scada", "unit": 1, "memory": "plant"}
     registers, coils = {"area": "holding_registers"}, {"area": "coils"}
     done = {"outcome": "done"}
     assert audited(tmp_path, 10) == [
@@ -109,7 +109,7 @@ def test_modbus_writes_are_audited_with_their_values(
         },
         {**scada, "function": 16, "outcome": "illegal_data_value"},
         {
-            **scada,
+            "listener": "scada",
             "unit": 9,
             "function": 6,
             **registers,
@@ -143,6 +143,7 @@ def test_datagrams_and_packets_are_audited(run: Run, tmp_path: Path) -> None:
             "listener": "datagrams",
             "unit": 1,
             "function": 6,
+            "memory": "plant",
             "area": "holding_registers",
             "address": 1,
             "values": [500],

@@ -797,6 +797,26 @@ def test_each_unit_of_a_line_has_its_own_memory(start: Start) -> None:
     assert plant.line.ask(READ, 247) == bytes.fromhex("03021234")
 
 
+def test_the_audit_log_names_the_memories_of_a_broadcast(start: Start, tmp_path: Path) -> None:
+    read_only = {"memory": "locked", "access": "read-only"}
+    plant = start(
+        units={1: "plant", 2: "other", 3: read_only},
+        memories=dict.fromkeys(("plant", "other", "locked"), ALL),
+        audit={"file": "audit.log"},
+    )
+    plant.line.send(plant.line.mode.frame(WRITE, 0))
+    plant.await_requests(1)
+    plant.appliance.stop()
+
+    found = writes(tmp_path / "audit.log")
+    assert {(line["unit"], line["memory"], line["outcome"]) for line in found} == {
+        (0, "plant", "done"),
+        (0, "other", "done"),
+        (0, "locked", "illegal_function"),
+    }
+    assert len(found) == 3
+
+
 def test_the_writes_of_a_line_are_audited(start: Start, tmp_path: Path) -> None:
     plant = start(audit={"file": "audit.log"})
     plant.line.send(plant.line.mode.frame(WRITE, 0))

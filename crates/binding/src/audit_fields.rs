@@ -46,12 +46,15 @@ pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, P
         None => line.set_item("peer", py.None())?,
     }
     match &record.write {
-        Written::Modbus { unit_id, pdu, refused, route } => {
+        Written::Modbus { unit_id, memory, pdu, refused, route } => {
             line.set_item("unit", unit_id)?;
             if let Some(route) = route {
                 line.set_item("route", &**route)?;
             }
             line.set_item("function", pdu.first())?;
+            if let Some(memory) = memory {
+                line.set_item("memory", &**memory)?;
+            }
             request(&line, pdu, route.is_some())?;
             line.set_item("outcome", refused.map_or_else(|| "done".into(), exception))?;
         }

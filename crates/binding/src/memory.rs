@@ -55,6 +55,7 @@ enum Seal {
 ///
 /// `seal` is the gate bit, in coils or discrete inputs. Modbus clients receive exception 06 until a
 /// write other than by Modbus sets that bit to 1: permanently (`once`), or while it is 1 (`level`).
+/// `name` is its name in the audit log.
 ///
 /// Raises `ValueError` for an invalid size or gate bit.
 #[pyclass(frozen, module = "holdfast")]
@@ -65,7 +66,7 @@ pub struct Memory {
 #[pymethods]
 impl Memory {
     #[new]
-    #[pyo3(signature = (*, coils=None, discrete_inputs=None, holding_registers=None, input_registers=None, files=None, seal=None))]
+    #[pyo3(signature = (*, coils=None, discrete_inputs=None, holding_registers=None, input_registers=None, files=None, seal=None, name=None))]
     fn new(
         coils: Option<Extent>,
         discrete_inputs: Option<Extent>,
@@ -73,6 +74,7 @@ impl Memory {
         input_registers: Option<Extent>,
         files: Option<Bound<'_, PyDict>>,
         seal: Option<Seal>,
+        name: Option<&str>,
     ) -> PyResult<Memory> {
         let extents = [coils, discrete_inputs, holding_registers, input_registers];
         let mut layout = Layout::default();
@@ -100,6 +102,10 @@ impl Memory {
         let gate = seal.map(gate).transpose()?;
         let core = Core::new(layout, gate)
             .map_err(|error| PyValueError::new_err(format!("seal: {error}")))?;
+        let core = match name {
+            Some(name) => core.named(name),
+            None => core,
+        };
         Ok(Memory { core: Arc::new(core) })
     }
 

@@ -107,7 +107,9 @@ fn broadcast_if(
     permit: Option<()>,
 ) -> Vec<Noted> {
     let mut noted = Vec::new();
-    let note = |reply: &[u8], sequence, permit| noted.push((reply.to_vec(), sequence, permit));
+    let note = |_: Option<&Memory>, reply: &[u8], sequence, permit| {
+        noted.push((reply.to_vec(), sequence, permit));
+    };
     let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
     runtime.block_on(unit_server.broadcast(rights, request, || permit, note));
     noted

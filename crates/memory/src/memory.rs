@@ -31,6 +31,7 @@ pub struct Memory {
     /// Locks of several memories are taken in the order of their ranks, so that two writers cannot
     /// deadlock.
     rank: u64,
+    name: Option<Arc<str>>,
     layout: Layout,
     gate: Option<Gate>,
     mirrored: RwLock<MirroredRanges>,
@@ -108,6 +109,7 @@ impl Memory {
         }
         Ok(Memory {
             rank: NEXT_RANK.fetch_add(1, Ordering::Relaxed),
+            name: None,
             layout,
             gate,
             mirrored: RwLock::default(),
@@ -120,6 +122,16 @@ impl Memory {
                 observers: Observers::default(),
             }),
         })
+    }
+
+    /// Names the memory in records of writes.
+    #[must_use]
+    pub fn named(self, name: &str) -> Memory {
+        Memory { name: Some(name.into()), ..self }
+    }
+
+    pub const fn name(&self) -> Option<&Arc<str>> {
+        self.name.as_ref()
     }
 
     /// Creates a memory of the same layout and gate, with all items 0.

@@ -140,20 +140,22 @@ class Memories(Part):
 def created(config: Config, name: str) -> Memory:
     """Creates a memory with its initial values; one that is kept gets its values later."""
     settings = config.memories[name]
-    made = empty(settings)
+    made = empty(config, name)
     if settings.keep is None:
         # The first node of a log begins with them; others get those of the log.
         fill(made, settings)
     return made
 
 
-def empty(settings: MemoryConfig) -> Memory:
-    """Creates the memory that the settings describe, with all values 0."""
+def empty(config: Config, name: str) -> Memory:
+    """Creates the memory of that name, with all values 0."""
+    settings = config.memories[name]
     seal = settings.seal
     return _core.Memory(
         **{area: (span.start, span.size) for area, span in settings.areas().items()},
         files=settings.files,
         seal=None if seal is None else (seal.area, seal.address, seal.mode),
+        name=name,
     )
 
 

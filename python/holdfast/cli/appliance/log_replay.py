@@ -96,7 +96,7 @@ def replay(
     log = chosen_log(config, name)
     settings = config.logs[log]
     memories = [
-        (each, empty(config.memories[each]))
+        (each, empty(config, each))
         for each, memory in config.memories.items()
         if memory.replicate is not None and memory.replicate.log == log
     ]

@@ -200,7 +200,8 @@ impl ListenerContext {
         let answered = &reply[..len.unwrap_or_default()];
         let refused = RefusedRequest::from_reply(rights, unit_id, request, answered);
         if let Some(auditor) = &self.auditor {
-            auditor.note(&self.name, peer, unit_id, (request, answered), permit);
+            let unit = (unit_id, rights.memory(unit_id));
+            auditor.note(&self.name, peer, unit, (request, answered), permit);
         }
         // A request for listen only mode has been reported as such.
         (len, refused.filter(|_| !is_for_listen_only))

@@ -13,6 +13,7 @@ use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
+use holdfast_memory::Memory;
 use holdfast_protocol::pdu::ExceptionCode;
 use tokio::sync::watch;
 
@@ -47,6 +48,8 @@ pub(in crate::server) struct Waiting {
 pub(in crate::server) struct Asked {
     pub(in crate::server) tag: u16,
     pub(in crate::server) unit_id: u8,
+    /// The name of the memory of the unit; `None` if it is a device.
+    memory: Option<Arc<str>>,
     /// The device that the request was passed on to; `None` if it was refused, or is of a memory.
     route: Option<Arc<str>>,
     request: Vec<u8>,
@@ -202,7 +205,8 @@ impl Asked {
                 (None, Expected::Known(Reply { pdu, ..Reply::default() }))
             }
         };
-        (Asked { tag, unit_id, route, request: request.to_vec(), permit }, reply, refused)
+        let memory = place.memory().and_then(Memory::name).cloned();
+        (Asked { tag, unit_id, memory, route, request: request.to_vec(), permit }, reply, refused)
     }
 
     /// Waits for the reply, and counts and records it: in a task of its own, which goes on if the caller does not.
@@ -239,10 +243,14 @@ impl Asked {
         reply: &Reply,
     ) {
         if let Some(auditor) = &context.auditor {
-            let Asked { unit_id, route, request, permit, .. } = self;
-            let (route, request, log_sequence) = (route.as_ref(), &request[..], reply.log_sequence);
-            let forwarded = Forwarded { route, request, reply: &reply.pdu, log_sequence };
-            auditor.note_forwarded(&context.name, peer, unit_id, forwarded, permit);
+            let forwarded = Forwarded {
+                memory: self.memory.as_ref(),
+                route: self.route.as_ref(),
+                request: &self.request,
+                reply: &reply.pdu,
+                log_sequence: reply.log_sequence,
+            };
+            auditor.note_forwarded(&context.name, peer, self.unit_id, forwarded, self.permit);
         }
     }
 }

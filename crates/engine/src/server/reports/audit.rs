@@ -10,6 +10,7 @@ use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
+use holdfast_memory::Memory;
 use holdfast_protocol::raw_ingest;
 use holdfast_runtime::lock;
 
@@ -52,10 +53,11 @@ pub struct Record {
     pub refusals: u64,
 }
 
-/// A request that was answered elsewhere, and its reply. `route` is the name of the device that it was
-/// passed on to.
+/// A request that was answered elsewhere, and its reply. `memory` is the name of the memory that it writes,
+/// `route` that of the device that it was passed on to.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Forwarded<'a> {
+    pub(crate) memory: Option<&'a Arc<str>>,
     pub(crate) route: Option<&'a Arc<str>>,
     pub(crate) request: &'a [u8],
     pub(crate) reply: &'a [u8],
@@ -64,9 +66,15 @@ pub(crate) struct Forwarded<'a> {
 
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Written {
-    /// A request, unchanged, and the code of the exception that it was refused with. `route` is the
-    /// name of what it was passed on to.
-    Modbus { unit_id: u8, pdu: Vec<u8>, refused: Option<u8>, route: Option<Arc<str>> },
+    /// A request, unchanged, and the code of the exception that it was refused with. `memory` is the
+    /// name of that of the unit, `route` that of what it was passed on to.
+    Modbus {
+        unit_id: u8,
+        memory: Option<Arc<str>>,
+        pdu: Vec<u8>,
+        refused: Option<u8>,
+        route: Option<Arc<str>>,
+    },
     /// A packet: its header, if it has a valid one, and the payload if it was written.
     Packet {
         format: raw_ingest::Format,
@@ -155,12 +163,13 @@ impl Auditor {
         &self,
         listener: &Arc<str>,
         peer: Option<&Peer>,
-        unit_id: u8,
+        (unit_id, memory): (u8, Option<&Memory>),
         (request, reply): (&[u8], &[u8]),
         permit: Option<Permit>,
     ) {
         if is_write(request) {
-            let answered = Forwarded { route: None, request, reply, log_sequence: None };
+            let memory = memory.and_then(Memory::name);
+            let answered = Forwarded { memory, route: None, request, reply, log_sequence: None };
             let record = || record(listener, peer, unit_id, answered);
             match permit {
                 Some(permit) if exception_in(reply).is_none() => self.send(record(), permit),
@@ -243,9 +252,14 @@ fn record(
     unit_id: u8,
     forwarded: Forwarded<'_>,
 ) -> Record {
-    let Forwarded { route, request, reply, log_sequence } = forwarded;
-    let refused = exception_in(reply);
-    let write = Written::Modbus { unit_id, pdu: request.to_vec(), refused, route: route.cloned() };
+    let Forwarded { memory, route, request, reply, log_sequence } = forwarded;
+    let write = Written::Modbus {
+        unit_id,
+        memory: memory.cloned(),
+        pdu: request.to_vec(),
+        refused: exception_in(reply),
+        route: route.cloned(),
+    };
     Record { listener: Arc::clone(listener), peer: peer.cloned(), write, log_sequence, refusals: 0 }
 }
 
@@ -336,13 +350,13 @@ mod tests {
     const READ: &[u8] = &[3, 0, 1, 0, 1];
 
     fn send(auditor: &Auditor, permit: Permit) {
-        auditor.note(&"scada".into(), None, 1, (WRITE, WRITE), Some(permit));
+        auditor.note(&"scada".into(), None, (1, None), (WRITE, WRITE), Some(permit));
     }
 
     /// Notes a write that was refused with this exception.
     fn refuse(auditor: &Auditor, peer: IpAddr, exception: u8) {
         let peer = SocketAddr::new(peer, 50_000).into();
-        auditor.note(&"scada".into(), Some(&peer), 1, (WRITE, &[0x86, exception]), None);
+        auditor.note(&"scada".into(), Some(&peer), (1, None), (WRITE, &[0x86, exception]), None);
     }
 
     #[test]
@@ -422,13 +436,14 @@ mod tests {
         let (auditor, records) = auditing(Unrecordable::Write);
         let sent = |permit| {
             let reply = &[0x86, 0x0B];
-            let forwarded = Forwarded { route: None, request: WRITE, reply, log_sequence: None };
+            let (memory, route, log_sequence) = (None, None, None);
+            let forwarded = Forwarded { memory, route, request: WRITE, reply, log_sequence };
             auditor.note_forwarded(&"scada".into(), None, 1, forwarded, permit);
         };
         sent(auditor.permit(true, WRITE));
         sent(None);
         // A unit in listen only mode has ignored it.
-        auditor.note(&"scada".into(), None, 1, (WRITE, &[]), None);
+        auditor.note(&"scada".into(), None, (1, None), (WRITE, &[]), None);
         let refusals = records.take(Duration::ZERO, 10).into_iter().map(|each| each.refusals);
         assert_eq!(refusals.collect::<Vec<_>>(), [0, 1]);
     }

@@ -251,14 +251,15 @@ impl UnitServer {
 
     /// Carries out a broadcast write (Serial Line V1.02, 2.1). It counts as one message without a
     /// reply, even if several memories carry it out. `permit` is asked before each that the peer may write, and
-    /// `note` receives the permit if the write may have been carried out, the reply that each would have sent, and where a log has the write. A journal is
-    /// waited for, because what follows on the line expects the effects.
+    /// `note` receives each memory, the reply that it would have sent, where a log has the write, and the permit if
+    /// the write may have been carried out. A journal is waited for, because what follows on the line
+    /// expects the effects.
     pub async fn broadcast<P>(
         &self,
         rights: &PeerRights,
         request: &[u8],
         mut permit: impl FnMut() -> Option<P>,
-        mut note: impl FnMut(&[u8], Option<u64>, Option<P>),
+        mut note: impl FnMut(Option<&Memory>, &[u8], Option<u64>, Option<P>),
     ) {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
@@ -291,7 +292,7 @@ impl UnitServer {
                 Some(code) => refused = refused.or(ExceptionCode::from_code(code)),
                 None => carried_out = true,
             }
-            note(&reply, log_sequence, permit);
+            note(rights.memory(unit_id), &reply, log_sequence, permit);
         }
         match refused {
             Some(code) => self.counters.exception(code),

@@ -10,6 +10,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU8, Ordering};
 use std::time::Duration;
 
+use holdfast_memory::Memory;
 use holdfast_protocol::frame::{ascii, rtu};
 use holdfast_protocol::pdu::{self, Function};
 use serial2_tokio::SerialPort;
@@ -356,9 +357,10 @@ impl ModbusSerial {
             return;
         }
         let permit = || context.permit(request);
-        let note = |reply: &[u8], log_sequence, permit| {
+        let note = |memory: Option<&Memory>, reply: &[u8], log_sequence, permit| {
             if let Some(auditor) = &context.auditor {
-                let forwarded = Forwarded { route: None, request, reply, log_sequence };
+                let memory = memory.and_then(Memory::name);
+                let forwarded = Forwarded { memory, route: None, request, reply, log_sequence };
                 auditor.note_forwarded(&context.name, None, BROADCAST, forwarded, permit);
             }
         };
