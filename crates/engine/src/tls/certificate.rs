@@ -40,6 +40,9 @@ const MAX_RSA_BITS: usize = 8192;
 const MAX_SUBJECT_LEN: usize = 256;
 const MAX_SERIAL_LEN: usize = 32;
 
+/// The most bytes of a role. No rule has a longer one, and the audit log repeats it for every write.
+const MAX_ROLE_LEN: usize = 255;
+
 /// The side that a peer is on. Its certificate must allow it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Purpose {
@@ -117,7 +120,10 @@ impl Parsed {
             (Some(extension), None) => Utf8StringRef::from_der(extension.extn_value.as_bytes()),
             (Some(_), Some(_)) => return Err(TlsFailure::TwoRoles),
         };
-        role.map(|role| role.to_string()).map_err(|_| TlsFailure::RoleType)
+        match role {
+            Ok(role) if role.as_str().len() <= MAX_ROLE_LEN => Ok(role.to_string()),
+            _ => Err(TlsFailure::RoleType),
+        }
     }
 
     /// Whether it is an authority: it has `CA:TRUE`, and its `keyUsage`, if any, has `keyCertSign`.
@@ -335,8 +341,8 @@ mod tests {
         assert_eq!(role(&[extension("\x0c\x03é!".as_bytes())]), Ok("é!".into()));
         let other = CustomExtension::from_oid_content(&ROLE_ARCS, vec![12, 1, 65]);
         assert_eq!(role(&[other]), Ok(String::new()));
-        let long = [&[12, 0x82, 1, 0][..], &[b'x'; 256]].concat();
-        assert_eq!(role(&[extension(&long)]), Ok("x".repeat(256)));
+        let longest = [&[12, 0x81, 255][..], &[b'x'; 255]].concat();
+        assert_eq!(role(&[extension(&longest)]), Ok("x".repeat(255)));
     }
 
     #[test]
@@ -356,6 +362,8 @@ mod tests {
         for content in malformed {
             assert_eq!(role(&[extension(content)]), Err(TlsFailure::RoleType));
         }
+        let too_long = [&[12, 0x82, 1, 0][..], &[b'x'; 256]].concat();
+        assert_eq!(role(&[extension(&too_long)]), Err(TlsFailure::RoleType));
         let twice = [extension(b"\x0c\x01a"), extension(b"\x0c\x01a")];
         assert_eq!(role(&twice), Err(TlsFailure::TwoRoles));
         let mut critical = extension(b"\x0c\x01a");

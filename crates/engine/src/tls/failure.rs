@@ -92,7 +92,7 @@ failures! {
     BadCertificate => "bad_certificate",
     #[error("the certificate has more than one role")]
     TwoRoles => "two_roles",
-    #[error("the role of the certificate is not a UTF8String")]
+    #[error("the role of the certificate is not a UTF8String of up to 255 bytes")]
     RoleType => "role_type",
     /// It is not among the allowed roles.
     #[error("the role {role:?} of the certificate is not allowed")]
