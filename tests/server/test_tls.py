@@ -969,11 +969,6 @@ def test_files_that_can_not_be_used_are_told_with_their_place(party: Party, tmp_
         ),
         ({"ca_file": nothing}, nothing, "found no certificate, allowed: a certificate in PEM"),
         (
-            {"ca_file": party.engineer.certificate},
-            party.engineer.certificate,
-            "certificate 1: neither an authority (CA:TRUE) nor self-signed",
-        ),
-        (
             {"crl_file": ca},
             ca,
             "found no revocation list, allowed: X509 CRL in PEM",

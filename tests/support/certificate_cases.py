@@ -191,8 +191,7 @@ class Case:
     name: str
     show: Show
     device: str = ACCEPTED
-    client: str | None = SERVED
-    """`None`: the listener refuses such a `ca_file`."""
+    client: str = SERVED
 
     def __str__(self) -> str:
         return self.name
@@ -335,7 +334,7 @@ CASES = [
     Case("CA:TRUE without keyCertSign", signed(CA, "keyUsage=digitalSignature"), *IS_CA),
     Case("CA:TRUE, listed", signed(CA, listed=True)),
     Case("of an unknown authority", _below_stranger, *UNKNOWN),
-    Case("of an unknown authority, listed", _listed_of_stranger, client=None),
+    Case("of an unknown authority, listed", _listed_of_stranger),
     Case("of an impostor", _impostor, "bad_signature", "bad_signature"),
     Case("keyUsage digitalSignature", signed("keyUsage=critical,digitalSignature")),
     Case("keyUsage nonRepudiation", signed("keyUsage=critical,nonRepudiation"), **NOT_TO_SIGN),

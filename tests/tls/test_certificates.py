@@ -38,7 +38,6 @@ from support.tls_peer import (
 from support.tls_peer import context as peer_context
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from support.certificate_cases import Case, Mint, Shown
@@ -251,7 +250,7 @@ def listener_cases(version: str) -> list[Any]:
     return [
         pytest.param(case, version, id=f"{case}-{version}")
         for case in CASES
-        if case.client is not None and (version == "1.3" or "RSA-PSS" not in case.name)
+        if version == "1.3" or "RSA-PSS" not in case.name
     ]
 
 
@@ -317,20 +316,6 @@ def test_a_client_is_judged_alike_by_https(
     appliance = run(rest(own, show.trusted))
     trust = peer_context(own.trusted, Issued(show.chain, show.key), version, weak=True)
     assert rest_verdict(appliance, trust) == case.client
-
-
-@pytest.mark.parametrize("configured", [listener, rest])
-@pytest.mark.parametrize("case", [case for case in CASES if case.client is None], ids=str)
-def test_a_listener_refuses_a_file_with_certificates_that_others_vouch_for(
-    case: Case,
-    configured: Callable[[Shown, Path], str],
-    mint: Mint,
-    shown: dict[str, Shown],
-    own: Shown,
-    run: Run,
-) -> None:
-    with pytest.raises((ValueError, OSError), match="certificate 1: neither an authority"):
-        run(configured(own, made(case, mint, shown).trusted))
 
 
 # What this side shows

@@ -13,7 +13,7 @@ use crate::arguments::word;
 
 /// Settings of a TLS server with mutual authentication. Reads the PEM files at once.
 ///
-/// `ca_file` has the authorities of client certificates, and self-signed certificates of clients;
+/// `ca_file` has the authorities of client certificates, and clients' own certificates;
 /// `crl_file` has the revocation lists of these authorities, and `expired_crl` is what happens to
 /// their clients after `nextUpdate`. `decrypted_key` is the content of `key_file` without its
 /// passphrase, if it has one. Raises `ValueError` for a file that can't be used.

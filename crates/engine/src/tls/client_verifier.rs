@@ -1,6 +1,5 @@
 //! Verifies the certificates of clients, for a server.
 
-use std::path::Path;
 use std::sync::Arc;
 
 use rustls::pki_types::{CertificateDer, UnixTime};
@@ -36,7 +35,7 @@ impl Clients {
         let Some(ca_file) = &files.ca_file else {
             return may_lack_authorities(files).map(|()| None);
         };
-        let listed = listed(ca_file)?;
+        let listed = Listed::of_file(ca_file)?;
         let subjects = listed.iter().filter_map(|each| each.parsed.subject()).collect();
         doubts.of_listed(ca_file, &listed);
         let lists = match &files.crl_file {
@@ -88,18 +87,6 @@ fn may_lack_authorities(files: &ServerFiles) -> Result<(), FileError> {
         return Err(FileError::content(&files.cert_file, flaw));
     }
     Ok(())
-}
-
-/// Reads authorities and self-signed certificates. Any other certificate is a mistake.
-fn listed(file: &Path) -> Result<Arc<[Listed]>, FileError> {
-    let listed = Listed::of_file(file)?;
-    let is_mistake = |listed: &Listed| !listed.is_authority() && !listed.parsed.is_self_signed();
-    if let Some(index) = listed.iter().position(is_mistake) {
-        let flaw =
-            format!("certificate {}: neither an authority (CA:TRUE) nor self-signed", index + 1);
-        return Err(FileError::content(file, flaw));
-    }
-    Ok(listed)
 }
 
 impl ClientCertVerifier for Clients {

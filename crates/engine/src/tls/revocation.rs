@@ -153,6 +153,15 @@ impl List {
             Err(_) => false,
         }
     }
+
+    /// # Errors
+    /// A certificate of its issuer is revoked.
+    fn check(&self, certificate: &Cert<'_>) -> Result<(), webpki::Error> {
+        match self.usable.find_serial(certificate.serial())? {
+            Some(_) => Err(webpki::Error::CertRevoked),
+            None => Ok(()),
+        }
+    }
 }
 
 /// The lists that certificates are judged by, the newest first. If there are any, every authority
@@ -190,6 +199,19 @@ impl Lists {
         self.check_certificate(end_entity, list, presented.as_ref(), listed, now)
     }
 
+    /// Judges a listed certificate, which needs no list: the operator vouches for it.
+    ///
+    /// # Errors
+    /// It is revoked.
+    pub(super) fn judge_listed(
+        &self,
+        certificate: &Cert<'_>,
+        parsed: &Parsed,
+    ) -> Result<(), webpki::Error> {
+        let list = self.find_list(certificate, parsed, !parsed.has_ca_flag());
+        list.map_or(Ok(()), |list| list.check(certificate))
+    }
+
     fn find_list(
         &self,
         certificate: &Cert<'_>,
@@ -221,10 +243,7 @@ impl Lists {
         if presented.is_some_and(|issuer| !issuer.may_sign_lists()) {
             return Err(webpki::Error::IssuerNotCrlSigner);
         }
-        match list.usable.find_serial(certificate.serial())? {
-            Some(_) => Err(webpki::Error::CertRevoked),
-            None => Ok(()),
-        }
+        list.check(certificate)
     }
 }
 
@@ -403,6 +422,17 @@ mod tests {
         let unknown = "unknown_revocation";
         assert_eq!(reason(&["http://b"], CrlScope::UserCertsOnly, "http://a"), unknown);
         assert_eq!(reason(&[], CrlScope::CaCertsOnly, "http://a"), unknown);
+    }
+
+    #[test]
+    fn a_listed_certificate_needs_no_list_but_can_be_revoked() {
+        let (root, other) = (Owner::authority("root", None), Owner::authority("other", None));
+        let leaf = Owner::new("leaf", Some(&root), numbered(4));
+        let reason = |lists: &[Vec<u8>]| judged(&leaf, lists, &[&leaf]);
+        assert_eq!(reason(&[]), "");
+        assert_eq!(reason(&[version_1(&other, &[&leaf])]), "");
+        assert_eq!(reason(&[version_1(&root, &[])]), "");
+        assert_eq!(reason(&[version_1(&root, &[&leaf])]), "revoked");
     }
 
     #[test]

@@ -10,7 +10,7 @@ pub struct ServerFiles {
     pub cert_file: PathBuf,
     /// The key of the certificate, without a passphrase.
     pub key_file: PathBuf,
-    /// Authorities of clients, and self-signed certificates of clients. `None`, only with HTTP:
+    /// Authorities of clients, and clients' own certificates. `None`, only with HTTP:
     /// clients need no certificate.
     pub ca_file: Option<PathBuf>,
     /// Revocation lists. If given, every authority above a client requires a list.

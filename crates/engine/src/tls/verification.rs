@@ -1,6 +1,6 @@
 //! Verifies certificates, for servers and clients alike.
 //!
-//! * A listed certificate is trusted, regardless of its `CA` flag and `keyUsage`.
+//! * A listed certificate is trusted, regardless of its `CA` flag and `keyUsage`, unless it is revoked.
 //! * A listed authority ([`Parsed::is_authority`]) can issue certificates within its own dates.
 //! * A presented certificate with `CA:TRUE` is trusted only if it is listed itself.
 //! * Dates and purpose of the presented certificate are always checked.
@@ -110,7 +110,7 @@ impl Trust {
         parsed.is_valid_at(now)?;
         parsed.is_for(purpose)?;
         if self.listed.iter().any(|listed| listed.certificate == *presented) {
-            return Ok(());
+            return self.lists.judge_listed(&end_entity, &parsed).map_err(refused);
         }
         // An authority is not a device: its own certificate must be listed to be accepted as one.
         if parsed.has_ca_flag() {

@@ -26,7 +26,7 @@ class ServerTlsConfig(_ServerFiles):
     """PEM files of a TLS server; they are read at the start and at a reload."""
 
     ca_file: FilePath
-    """Authorities of client certificates, and self-signed certificates of clients."""
+    """Authorities of client certificates, and clients' own certificates."""
     crl_file: Annotated[FilePath | None, NotNull()] = None
     """Certificate revocation lists: one of each authority in the chain of a client."""
     expired_crl: ExpiredLists = "refuse"
@@ -40,7 +40,7 @@ class HttpsConfig(_ServerFiles):
     """PEM files of an HTTPS server; they are read at the start and at a reload."""
 
     client_ca_file: Annotated[FilePath | None, NotNull()] = None
-    """Authorities of client certificates, and self-signed certificates of clients. Default: clients
+    """Authorities of client certificates, and clients' own certificates. Default: clients
     need no certificate."""
     crl_file: Annotated[FilePath | None, NotNull()] = None
     """Certificate revocation lists: one of each authority in the chain of a client; requires
