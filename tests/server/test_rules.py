@@ -6,17 +6,20 @@ A connection is judged once, when it is accepted; over UDP each datagram is.
 from __future__ import annotations
 
 import contextlib
+import logging
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, Protocol
 
 import pytest
 
+from holdfast.config import load
 from support import wire
 from support.config_folder import written
 from support.machine import needs_127_0_0_2
 from support.running import content, endpoint, log_events
 from support.transports import (
     ALL,
+    TRANSPORTS,
     TYPES,
     Client,
     address,
@@ -29,6 +32,7 @@ from support.transports import (
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from holdfast.appliance import Appliance
     from support.running import Run
@@ -351,6 +355,40 @@ def test_a_peer_cannot_silence_a_unit_for_others(
     fields = refused.fields  # type: ignore[attr-defined]
     assert fields["listener"] == "scada"
     assert fields["peer"].startswith("127.0.0.1:")
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_who_silences_a_unit_is_logged_and_a_reload_ends_it(
+    kind: str, run: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "holdfast")
+    rules = [{**rule(["127.0.0.1"]), "units": {1: "plant", 2: "plant"}}]
+    appliance = run(configuration(kind, rules=rules, listen_only=True))
+    forbidden = tmp_path / "forbidden.yaml"
+    forbidden.write_text(configuration(kind, rules=rules))
+    silence, restart = bytes.fromhex("0800040000"), bytes.fromhex("0800010000")
+
+    with client(kind, address(appliance)) as peer:
+        # The second request to be silent is ignored, as is the write: they are no events.
+        for pdu in (silence, silence, WRITE, restart, silence):
+            peer.send(TRANSPORTS[kind].frame(pdu))
+        assert peer.ask(READ, 2) == ZERO
+        appliance.reload(load(forbidden))
+        assert peer.ask(READ) == ZERO
+        assert peer.ask(silence) == b"\x88\x01"
+
+    log_events(appliance)
+    fields = [(each.message, vars(each)["fields"]) for each in caplog.records]
+    assert [
+        (event, found["unit"], found["peer"].rpartition(":")[0])
+        for event, found in fields
+        if event in ("unit_silenced", "unit_back")
+    ] == [
+        ("unit_silenced", 1, "127.0.0.1"),
+        ("unit_back", 1, "127.0.0.1"),
+        ("unit_silenced", 1, "127.0.0.1"),
+        ("unit_back", 1, ""),
+    ]
 
 
 # What the log has of refused requests

@@ -718,10 +718,15 @@ def test_a_unit_in_listen_only_mode_keeps_silent_whatever_is_asked(text: str, st
     assert plant.counters["unanswered"] == 2
 
 
-def test_a_restart_ends_listen_only_mode_without_a_reply(plant: Plant) -> None:
+def test_a_restart_ends_listen_only_mode_without_a_reply(
+    plant: Plant, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "holdfast")
     for number, pdu in enumerate((LISTEN_ONLY, WRITE, RESTART), 1):
         plant.line.send(plant.line.mode.frame(pdu))
         plant.await_requests(number)
+    for event in ("unit_silenced", "unit_back"):
+        wire.until(lambda: logged(plant, caplog, event), f"{event} is logged")  # noqa: B023
 
     assert plant.serves()
     assert plant.line.ask(RESTART) == RESTART

@@ -246,6 +246,9 @@ pub(crate) fn event_fields<'py>(py: Python<'py>, event: &Event) -> PyResult<Boun
     if let Some(bytes) = event.kind.bytes() {
         fields.set_item("bytes", bytes)?;
     }
+    if let Kind::UnitSilenced(unit_id) | Kind::UnitBack(unit_id) = event.kind {
+        fields.set_item("unit", unit_id)?;
+    }
     if let Kind::RefusedRequest(refused) = event.kind {
         fields.set_item("unit", refused.unit_id)?;
         fields.set_item("function", refused.function_code)?;

@@ -40,6 +40,7 @@ _MEANINGS: Mapping[tuple[str, str, Outcome], str] = {
     ("session", "start", "failure"): "refused_role",
     ("session", "end", "success"): "rights_revoked session_ended",
     # Requests
+    ("network", "protocol allowed", "success"): "unit_silenced unit_back",
     ("network", "protocol denied", "failure"): """
         refused_function refused_unit refused_address refused_sealed refused_listen_only
         packet_refused surplus_bytes bytes_dropped broken_request message_malformed""",

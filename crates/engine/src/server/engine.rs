@@ -29,7 +29,7 @@ use crate::server::reports::event::{
     Event, Events, Kind, Reporter, Verbosity, channel as event_channel,
 };
 use crate::server::requests::identity::Identity;
-use crate::server::requests::unit_server::UnitServer;
+use crate::server::requests::unit_server::{UnitServer, UnitSettings};
 use crate::server::rights::peer_rights::PeerRights;
 use crate::server::rights::policy::Policy;
 use crate::server::transports::raw_ingest::{RawIngest, RawSettings};
@@ -491,7 +491,7 @@ impl Listener {
                 let (live, units) = (Arc::clone(live), Arc::clone(units));
                 let (limits, settings) = (new.limits, new.units);
                 Some(Box::new(move |listener| {
-                    units.update(identity, settings);
+                    listener.update_units(&units, identity, settings);
                     listener.take_over(&live, service, limits);
                 }))
             }
@@ -508,8 +508,8 @@ impl Listener {
                 let policy = Arc::new(Policy::of(&new.rules));
                 let (live, units) = (Arc::clone(live), Arc::clone(units));
                 let settings = new.units;
-                Some(Box::new(move |_| {
-                    units.update(identity, settings);
+                Some(Box::new(move |listener| {
+                    listener.update_units(&units, identity, settings);
                     live.replace(policy);
                 }))
             }
@@ -519,12 +519,18 @@ impl Listener {
                 let rights = Arc::new(PeerRights::new(&new.rule));
                 let (live, units) = (Arc::clone(live), Arc::clone(units));
                 let settings = new.units;
-                Some(Box::new(move |_| {
-                    units.update(identity, settings);
+                Some(Box::new(move |listener| {
+                    listener.update_units(&units, identity, settings);
                     live.replace(rights);
                 }))
             }
             _ => None,
+        }
+    }
+
+    fn update_units(&self, units: &UnitServer, identity: Identity, settings: UnitSettings) {
+        for unit_id in units.update(identity, settings) {
+            self.context.report(Kind::UnitBack(unit_id), None);
         }
     }
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 GROUP = "add the user to the group of the device, on Linux mostly dialout"
 
-# Events that are not rate-limited. All others are, as warnings; `secured` is info.
+# Events that are not rate-limited. All others are, as warnings or LIMITED_INFOS.
 LEVELS = {
     "opened": logging.DEBUG,
     "closed": logging.DEBUG,
@@ -38,6 +38,8 @@ LEVELS = {
     "rights_revoked": logging.INFO,
     "ended": logging.DEBUG,
 }
+
+LIMITED_INFOS = ("secured", "unit_back")
 
 # Events whose number is limited for each role.
 BY_ROLE = ("secured", "refused_role")
@@ -198,6 +200,6 @@ def _log_event(listener: str, event: str, found: Mapping[str, object]) -> None:
     if event in LEVELS:
         log_lines.write(LEVELS[event], event, **fields)
     else:
-        level = logging.INFO if event == "secured" else logging.WARNING
+        level = logging.INFO if event in LIMITED_INFOS else logging.WARNING
         about = found.get("role" if event in BY_ROLE else "reason")
         log_lines.count(level, event, fields, kind=(listener, about), times=times)

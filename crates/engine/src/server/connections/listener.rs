@@ -197,6 +197,9 @@ impl ListenerContext {
             permit.is_some()
         };
         let len = unit_server.answer(rights, unit_id, request, ask, reply);
+        if len.is_none() {
+            self.report_silence((unit_server, permit.is_some()), peer, unit_id, request);
+        }
         let answered = &reply[..len.unwrap_or_default()];
         let refused = RefusedRequest::from_reply(rights, unit_id, request, answered);
         if let Some(auditor) = &self.auditor {
@@ -205,6 +208,24 @@ impl ListenerContext {
         }
         // A request for listen only mode has been reported as such.
         (len, refused.filter(|_| !is_for_listen_only))
+    }
+
+    /// Reports a request without a reply that has silenced its unit, or ended that.
+    #[cold]
+    fn report_silence(
+        &self,
+        (unit_server, is_permitted): (&UnitServer, bool),
+        peer: Option<&Peer>,
+        unit_id: u8,
+        request: &[u8],
+    ) {
+        // A silent unit ignores a request before its permit. Of all others, only the one that silences the
+        // unit has no reply.
+        if is_permitted {
+            self.report(Kind::UnitSilenced(unit_id), peer.cloned());
+        } else if unit_server.listen_only.was_ended_by(unit_id, request) {
+            self.report(Kind::UnitBack(unit_id), peer.cloned());
+        }
     }
 
     /// Reports the first refusal for each reason. The exceptions are counted elsewhere.

@@ -55,6 +55,10 @@ pub enum Kind {
     RefusedFull,
     /// A peer asked for listen only mode, which the listener does not allow.
     RefusedListenOnly,
+    /// A peer has set this unit to listen only mode.
+    UnitSilenced(u8),
+    /// A peer or a reload has ended the listen only mode of this unit.
+    UnitBack(u8),
     /// A request was refused because of rights, or because a memory is sealed.
     RefusedRequest(RefusedRequest),
     /// TLS failed, usually in the handshake. The reason is a word for programs.
@@ -102,6 +106,8 @@ impl Kind {
             Kind::RefusedRole => "refused_role",
             Kind::RefusedFull => "refused_full",
             Kind::RefusedListenOnly => "refused_listen_only",
+            Kind::UnitSilenced(_) => "unit_silenced",
+            Kind::UnitBack(_) => "unit_back",
             Kind::RefusedRequest(refused) => refused.why.name(),
             Kind::TlsFailed(_) => "tls_failed",
             Kind::AcceptError(_) => "accept_error",

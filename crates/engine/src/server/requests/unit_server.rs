@@ -68,11 +68,11 @@ impl UnitServer {
         UnitServer { counters, identity, listen_only, comm_events }
     }
 
-    /// Changes what a reload can change.
-    pub(crate) fn update(&self, identity: Identity, settings: UnitSettings) {
+    /// Changes what a reload can change. Returns the units whose listen only mode this has ended.
+    pub(crate) fn update(&self, identity: Identity, settings: UnitSettings) -> Vec<u8> {
         self.identity.replace(Arc::new(identity));
-        self.listen_only.set_allowed(settings.listen_only);
         self.comm_events.set(settings.event_log);
+        self.listen_only.set_allowed(settings.listen_only)
     }
 
     /// Carries out a request and writes the reply. Returns its length, or `None` when there is no
