@@ -7,6 +7,7 @@ import functools
 import json
 import re
 import shutil
+import signal
 import socket
 import threading
 from contextlib import ExitStack
@@ -22,7 +23,7 @@ from holdfast.appliance.reload import ReloadRefused
 from holdfast.config import load
 from support import audits, event_streams, web, wire
 from support.brokers import NatsServer, free_port
-from support.cli import done, invoke, usage_error
+from support.cli import ServingCommand, done, early_lines, invoke, usage_error
 from support.config_folder import Folder, written
 from support.running import endpoint
 
@@ -509,9 +510,10 @@ def test_a_larger_memory_begins_a_new_log_with_the_values_of_the_old_one(
         (["--output", "x.csv", "--memory", "mor"], "no memory 'mor', allowed: plant, more; did"),
         (["--output", "x.json"], "found x.json, allowed: a file with one of .csv, .yaml, .yml"),
         (["--output", "x.csv", "--follow"], "--follow and --output can't be used together"),
+        (["--values", "--follow"], "--follow and --values can't be used together"),
         (["--memory", "plant"], "--memory is for --output"),
     ],
-    ids=["several", "unknown", "kind", "follow", "alone"],
+    ids=["several", "unknown", "kind", "follow", "values", "alone"],
 )
 def test_a_replay_writes_one_memory(tmp_path: Path, options: list[str], told: str) -> None:
     file = tmp_path / "a.yaml"
@@ -521,6 +523,30 @@ def test_a_replay_writes_one_memory(tmp_path: Path, options: list[str], told: st
         "rest: {bind: 127.0.0.1:0, sources: [127.0.0.1], tokens: none}\n"
     )
     assert told in usage_error("log", "replay", str(file), *options)
+
+
+def test_a_replay_that_follows_serves_what_it_has_followed(
+    node: Callable[..., Appliance], tmp_path: Path
+) -> None:
+    # It proves its contact with messages without steps, and they print nothing.
+    one = node("a", log={"max_lag": 0.2})
+    ask(one, "060003002a")
+    file = str(tmp_path / "a.yaml")
+    replay = ServingCommand("log", "replay", file, "--follow", "--bind", "127.0.0.1:0")
+    try:
+        step, *_ = replay.wait_for_greeting().splitlines()
+        assert step.endswith(" a plant holding_registers 3: 42")
+        match = re.search(r"plant: tcp://([0-9.]+):([0-9]+), unit 1", replay.greeting)
+        assert match, replay.greeting
+        with wire.Connection((match[1], int(match[2]))) as connection:
+            read = bytes.fromhex("0300030001")
+            assert connection.ask(read).hex() == "0302002a"
+            ask(one, "060003002b")
+            wire.until(lambda: connection.ask(read).hex() == "0302002b", "it has followed")
+        [step] = early_lines(replay.process, 1)
+        assert step.endswith(" a plant holding_registers 3: 43\n")
+    finally:
+        replay.end(signal.SIGTERM)
 
 
 def test_a_replay_to_behind_the_end_of_the_log_says_so(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -90,6 +90,8 @@ def replay(
         raise click.UsageError("--follow and --to can't be used together.")
     if follow and output is not None:
         raise click.UsageError("--follow and --output can't be used together.")
+    if follow and values:
+        raise click.UsageError("--follow and --values can't be used together.")
     if memory is not None and output is None:
         raise click.UsageError("--memory is for --output.")
     config = load_or_exit(file)
@@ -121,7 +123,12 @@ def replay(
             )
             replaying = opened()
             last = replaying.sequence
+            to_serve = bind if follow else None
             while not signals.received and not replaying.ended:
+                # Not the values of a snapshot that the log has left behind.
+                if to_serve is not None and replaying.sequence >= replaying.last_sequence:
+                    running.enter_context(_served(memories, to_serve, as_json=as_json))
+                    to_serve = None
                 try:
                     record = replaying.next(SIGNAL_INTERVAL_S)
                 except _core.LogError as error:
@@ -135,7 +142,9 @@ def replay(
                 # After an outage, what was shown before it comes again.
                 if record is not None and follow and record["sequence"] > last:
                     last = record["sequence"]
-                    click.echo(_line(file, record, as_json=as_json))
+                    # Nodes without writes prove their contact with messages without steps.
+                    if record["steps"]:
+                        click.echo(_line(file, record, as_json=as_json))
             if not follow:
                 if not replaying.ended:
                     fail("interrupted", reason="interrupted")
@@ -154,8 +163,10 @@ def replay(
             shown = nats_servers(settings).shown
             where = f" (servers: {shown})" if isinstance(error, _core.LogError) else ""
             fail(f"logs.{log}: {error}{where}", reason="connection" if where else "failed")
-    if bind is not None and not signals.received:
-        _serve(memories, bind, signals, as_json=as_json)
+    if bind is not None and not follow and not signals.received:
+        with _served(memories, bind, as_json=as_json):
+            while not signals.received:
+                time.sleep(SIGNAL_INTERVAL_S)
 
 
 def _chosen(memories: dict[str, _core.Memory], name: str | None, output: Path) -> _core.Memory:
@@ -281,9 +292,10 @@ def _step(step: Any) -> str:
     return "; ".join(writes) + (f" (refused: {refused})" if refused else "")
 
 
-def _serve(
-    memories: list[tuple[str, _core.Memory]], bind: Bind, signals: Signals, *, as_json: bool
-) -> None:
+@contextmanager
+def _served(
+    memories: list[tuple[str, _core.Memory]], bind: Bind, *, as_json: bool
+) -> Iterator[None]:
     units = {unit: memory for unit, (_, memory) in enumerate(memories, start=1)}
     try:
         server = Server(units, bind=str(bind), access="read-only")
@@ -294,5 +306,4 @@ def _serve(
         for unit, (name, _) in enumerate(memories, start=1):
             click.echo(f"{name}: tcp://{host}:{bound}, unit {unit}, read-only", err=as_json)
         click.echo("Ctrl-C stops it.", err=as_json)
-        while not signals.received:
-            time.sleep(SIGNAL_INTERVAL_S)
+        yield
