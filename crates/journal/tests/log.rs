@@ -477,6 +477,62 @@ fn a_node_joins_late_with_a_snapshot_and_the_stream_is_purged() {
     until("all have it", || a.read(7) == Ok(7777) && b.read(7) == Ok(7777));
 }
 
+/// A log of few large messages would fill the disks of its servers.
+#[test]
+fn a_snapshot_is_also_due_by_bytes() {
+    let server = Server::new();
+    let node = Node::new(&[&server], "a", |settings| settings.snapshot_bytes = 5000);
+    node.start();
+    until("two snapshots are taken", || {
+        node.write(0, 1).unwrap();
+        first_sequence(&server) > 1
+    });
+}
+
+#[test]
+fn a_log_without_room_goes_on_behind_its_newest_snapshot() {
+    let server = Server::new();
+    let node = Node::new(&[&server], "a", |settings| settings.snapshot_steps = 20);
+    node.start();
+    until("a snapshot is stored", || {
+        node.write(0, 1).unwrap();
+        node.status().snapshot.is_some_and(|sequence| sequence > 1)
+    });
+    fill(&server);
+    node.write_at_last(0, 2);
+    assert!(first_sequence(&server) > 1);
+    let b = Node::started(&[&server], "b");
+    assert_eq!(b.read(0), Ok(2));
+}
+
+#[test]
+fn a_node_that_starts_says_that_the_log_has_no_room() {
+    let server = Server::new();
+    drop(Node::started(&[&server], "a"));
+    fill(&server);
+    let node = Node::new(&[&server], "a", |_| {});
+    node.log.start().unwrap();
+    until("it says why nothing is confirmed", || {
+        let error = node.status().last_error.unwrap_or_default();
+        error.starts_with("the log has confirmed nothing for ")
+            && error.ends_with(" s: the stream refuses messages: maximum bytes exceeded")
+    });
+}
+
+/// From now on, the stream has no room for further messages.
+fn fill(server: &Server) {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        let stream = jetstream.get_stream("holdfast-log-site").await.unwrap();
+        let info = stream.cached_info();
+        let mut config = info.config.clone();
+        config.max_bytes = info.state.bytes as i64;
+        jetstream.update_stream(config).await.unwrap();
+    });
+}
+
 /// Whoever may delete what the log keeps beside its steps can't make it unusable while a node runs.
 #[test]
 fn snapshots_are_stored_again_after_a_bucket_of_the_log_was_deleted() {

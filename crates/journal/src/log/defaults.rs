@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::parts::comparer::DIGEST_EVERY;
-use super::parts::snapshotter::SNAPSHOT_STEPS;
+use super::parts::snapshotter::{SNAPSHOT_BYTES, SNAPSHOT_STEPS};
 use super::parts::wrong_contents::REJOIN_AFTER;
 use super::settings::{Login, Servers, Settings};
 use super::stream::connection::CONNECT_TIMEOUT;
@@ -31,6 +31,7 @@ impl Settings {
             refuses_when_behind: false,
             max_lag: MAX_LAG,
             snapshot_steps: SNAPSHOT_STEPS,
+            snapshot_bytes: SNAPSHOT_BYTES,
             digest_every: DIGEST_EVERY,
             rejoin_after: Some(REJOIN_AFTER),
             memory_file: None,

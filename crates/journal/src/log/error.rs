@@ -92,6 +92,14 @@ impl End {
         End::Lost(format!("{what}: only a new snapshot of a node that has applied them helps"))
     }
 
+    pub(super) fn reason(self) -> String {
+        match self {
+            End::Stopped => "the log was stopped".to_owned(),
+            End::Lost(reason) => reason,
+            End::Fatal(error) => error.to_string(),
+        }
+    }
+
     /// What a server could not do for now.
     pub(super) fn lost(what: &str, error: impl std::fmt::Display) -> End {
         End::Lost(format!("{what}: {error}"))

@@ -225,15 +225,10 @@ pub(super) async fn digest_at(
     sequence: u64,
 ) -> Result<String, String> {
     let until = Until::Sequence(sequence);
-    let text = |end: End| match end {
-        End::Stopped => "the log was stopped".to_owned(),
-        End::Lost(reason) => reason,
-        End::Fatal(error) => error.to_string(),
-    };
     let known = [pointer.previous.as_ref(), Some(&pointer.newest)];
-    let mut reading = read_from(store, known, members, until).await.map_err(text)?;
+    let mut reading = read_from(store, known, members, until).await.map_err(End::reason)?;
     while reading.state.place.sequence < sequence {
-        reading.next(until).await.map_err(text)?;
+        reading.next(until).await.map_err(End::reason)?;
     }
     Ok(digest_of(&reading.state.encode()))
 }

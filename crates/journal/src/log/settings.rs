@@ -58,6 +58,9 @@ pub struct Settings {
     pub max_lag: Duration,
     /// A snapshot is taken after so many steps.
     pub snapshot_steps: u64,
+    /// A snapshot is also taken after so many bytes of messages.
+    #[doc(hidden)]
+    pub snapshot_bytes: u64,
     /// Digests are compared at sequences that are multiples of this.
     pub digest_every: u64,
     /// A node whose contents differ rejoins by itself, unless it has done so within this time; with

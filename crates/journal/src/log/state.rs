@@ -144,6 +144,12 @@ impl State {
         if self.terms.is_empty() { WITHOUT_LEASES } else { VERSION }
     }
 
+    /// How long the contents are.
+    pub(super) fn contents_bytes(&self) -> u64 {
+        let lens = self.members.iter().flat_map(|memory| memory.layout().byte_lens());
+        lens.map(|len| len as u64).sum()
+    }
+
     pub(super) fn encode(&self) -> Vec<u8> {
         let contents = Memory::contents(&self.members);
         let len: usize =

@@ -13,6 +13,8 @@ pub(in crate::log) enum Report {
     Stored((u64, Pointer)),
     /// Why a snapshot was not stored, the revision of the key that was known, and what the key names now.
     NotStored { reason: String, known: Option<u64>, found: Result<Option<(u64, Pointer)>, End> },
+    /// How many messages were removed behind the newest snapshot, for want of room.
+    Freed(Result<u64, String>),
     /// The digest that the log leads to.
     Replayed { sequence: u64, digest: Result<String, String> },
 }

@@ -6,6 +6,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use async_nats::jetstream::ErrorCode;
 use async_nats::{Client, HeaderMap, StatusCode, Subscriber, header};
 use bytes::Bytes;
 use holdfast_memory::{CarriedOut, Done, Outcome};
@@ -24,6 +25,14 @@ use crate::log::stream::store::{subject, unique};
 /// The most bytes of steps that are sent in one message with others.
 const MAX_BATCH_BYTES: usize = 64 << 10;
 
+/// The errors of a server, an account or a stream that has no room, and of a disk that is full.
+const NO_ROOM: [ErrorCode; 4] = [
+    ErrorCode::INSUFFICIENT_RESOURCES,
+    ErrorCode::ACCOUNT_RESOURCES_EXCEEDED,
+    ErrorCode::STORAGE_RESOURCES_EXCEEDED,
+    ErrorCode::STREAM_STORE_FAILED,
+];
+
 /// A message has room for this many bytes of protocol, beside its payload.
 const HEADER_BYTES: usize = 1024;
 
@@ -39,6 +48,16 @@ pub(in crate::log) struct Sender {
     /// Of the last message that was sent.
     counter: u64,
     in_flight: InFlight,
+    /// Why the stream has refused messages, since the last one of this node was applied.
+    refusal: Option<String>,
+}
+
+/// What the stream replied to a message.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::log) enum Acknowledged {
+    /// The servers have no room for it.
+    NoRoom,
+    Other,
 }
 
 /// The start of this node, which orders its messages behind those of earlier processes.
@@ -84,9 +103,9 @@ impl Start {
 
 impl Sender {
     pub(in crate::log) fn new(settings: &Arc<Settings>, shared: &Arc<Shared>) -> Sender {
-        let in_flight = InFlight::default();
+        let (in_flight, refusal) = (InFlight::default(), None);
         let (settings, shared) = (Arc::clone(settings), Arc::clone(shared));
-        Sender { settings, shared, start: Start::None, counter: 0, in_flight }
+        Sender { settings, shared, start: Start::None, counter: 0, in_flight, refusal }
     }
 
     pub(in crate::log) fn has_started(&self) -> bool {
@@ -148,6 +167,7 @@ impl Sender {
         self.check_start(origin)?;
         let Some(counter) = self.own_counter(origin) else { return Ok(None) };
         self.start = Start::Applied(origin.start);
+        self.refusal = None;
         let sent = self.in_flight.applied(counter, outcomes, &self.shared.counters);
         // All that the log had when it was sent comes before it, and was applied.
         if let Some(at) = sent {
@@ -237,24 +257,34 @@ impl Sender {
     pub(in crate::log) fn acknowledged(
         &mut self,
         ack: Option<async_nats::Message>,
-    ) -> Result<(), End> {
+    ) -> Result<Acknowledged, End> {
         let Some(ack) = ack else { return Err(End::Lost("a subscription has ended".to_owned())) };
         let counter = ack.subject.rsplit('.').next().and_then(|counter| counter.parse().ok());
         // Anyone may send to the inbox.
-        let Some(counter) = counter else { return Ok(()) };
+        let Some(counter) = counter else { return Ok(Acknowledged::Other) };
         if ack.status == Some(StatusCode::NO_RESPONDERS) {
             self.in_flight.not_taken(counter, &self.shared.counters);
             self.report("the stream has no leader");
         } else if let Some(error) = refusal(&ack.payload) {
             self.in_flight.not_stored(counter, &self.shared.counters);
-            self.report(&format!("the stream refuses messages: {error}"));
+            let description = error.description.as_deref().unwrap_or("no reason");
+            self.report(&format!("the stream refuses messages: {description}"));
+            if NO_ROOM.contains(&error.err_code) {
+                return Ok(Acknowledged::NoRoom);
+            }
         }
         // A message that was stored is not confirmed before it is applied.
-        Ok(())
+        Ok(Acknowledged::Other)
+    }
+
+    /// Why the stream has refused messages, since the last one of this node was applied.
+    pub(in crate::log) fn refusal(&self) -> Option<&str> {
+        self.refusal.as_deref()
     }
 
     /// Shows an error in the status, and as an event if it is new.
-    fn report(&self, reason: &str) {
+    fn report(&mut self, reason: &str) {
+        self.refusal = Some(reason.to_owned());
         if self.shared.view().last_error.as_deref() != Some(reason) {
             self.shared.event(Event::new("log_error", &[("reason", reason)]));
             self.shared.update(|view| view.last_error = Some(reason.to_owned()));
@@ -326,22 +356,24 @@ impl Publisher {
     }
 }
 
+#[derive(Deserialize)]
+struct Refused {
+    #[serde(default)]
+    err_code: ErrorCode,
+    description: Option<String>,
+}
+
 /// The error in the answer of a stream, if it has not stored a message.
-fn refusal(answer: &[u8]) -> Option<String> {
+fn refusal(answer: &[u8]) -> Option<Refused> {
     #[derive(Deserialize)]
     struct Answer {
         error: Option<Refused>,
-    }
-    #[derive(Deserialize)]
-    struct Refused {
-        description: String,
     }
     // Most answers are short and have no error: they are not parsed.
     if !answer.windows(7).any(|part| part == b"\"error\"") {
         return None;
     }
-    let answer: Answer = serde_json::from_slice(answer).ok()?;
-    answer.error.map(|error| error.description)
+    serde_json::from_slice::<Answer>(answer).ok()?.error
 }
 
 #[cfg(test)]

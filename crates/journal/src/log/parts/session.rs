@@ -18,7 +18,7 @@ use crate::log::error::End;
 use crate::log::parts::background::{Background, Report};
 use crate::log::parts::comparer::Replayed;
 use crate::log::parts::node::{CHECK_INTERVAL, Node};
-use crate::log::parts::sender::Publisher;
+use crate::log::parts::sender::{Acknowledged, Publisher};
 use crate::log::parts::session_start::join;
 use crate::log::state::{Applied, digest_of};
 use crate::log::status::{Event, Phase};
@@ -131,7 +131,11 @@ impl<'n> Session<'n> {
                     self.announce().await?;
                     self.send_waiting().await?;
                 }
-                ack = acks.next() => self.node.sender.acknowledged(ack)?,
+                ack = acks.next() => {
+                    if self.node.sender.acknowledged(ack)? == Acknowledged::NoRoom {
+                        self.node.snapshotter.make_room(&self.background);
+                    }
+                }
                 () = self.node.shared.arrived.notified() => self.send_waiting().await?,
                 entry = watch.next() => match entry {
                     Some(Ok(entry)) => self.watched(&entry)?,
@@ -190,6 +194,7 @@ impl<'n> Session<'n> {
         let applied = applier.receive(received, |origin| sender.first_sent(origin))?;
         let Some(applied) = applied else { return Ok(()) };
         self.last_applied = Instant::now();
+        self.node.snapshotter.applied(received.payload.len());
         let (mut compares, mut is_for_snapshot) = (false, false);
         match applied {
             Applied::Fresh { origin, compares: is_asked, outcomes } => {
@@ -299,6 +304,7 @@ impl<'n> Session<'n> {
             Report::NotStored { reason, known, found } => {
                 self.node.snapshotter.failed(&reason, known, found)?;
             }
+            Report::Freed(freed) => self.node.snapshotter.freed(freed),
             Report::Replayed { sequence, digest } => self.replayed(sequence, digest)?,
         }
         Ok(())
@@ -332,7 +338,11 @@ impl<'n> Session<'n> {
         if silent > self.node.settings.silence() {
             self.check_end().await?;
             let seconds = silent.as_secs_f64();
-            return Err(End::Lost(format!("the log has confirmed nothing for {seconds:.1} s")));
+            let mut reason = format!("the log has confirmed nothing for {seconds:.1} s");
+            if let Some(refusal) = self.node.sender.refusal() {
+                reason = format!("{reason}: {refusal}");
+            }
+            return Err(End::Lost(reason));
         }
         self.prove_contact(now).await?;
         self.send_waiting().await?;

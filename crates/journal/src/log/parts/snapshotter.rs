@@ -18,6 +18,11 @@ use crate::log::stream::store::{Pointer, Snapshot};
 pub(in crate::log) const SNAPSHOT_STEPS: u64 = 100_000;
 const SNAPSHOT_AFTER: Duration = Duration::from_secs(600);
 
+/// A snapshot is also taken after this many bytes of messages, or after this many times the contents if that
+/// is more: it limits what the servers have to store.
+pub(in crate::log) const SNAPSHOT_BYTES: u64 = 64 << 20;
+const SNAPSHOT_CONTENTS: u64 = 4;
+
 /// How long a snapshot, or a node that rejoins, waits for the digests of other nodes.
 pub(in crate::log) const DIGESTS_TIMEOUT: Duration = Duration::from_secs(5);
 
@@ -29,6 +34,10 @@ pub(in crate::log) struct Snapshotter {
     settings: Arc<Settings>,
     shared: Arc<Shared>,
     known: Option<Known>,
+    /// Of the messages that were applied since the newest snapshot was known.
+    bytes: u64,
+    /// The newest snapshot before which messages were removed to make room.
+    freed: u64,
     stage: Stage,
 }
 
@@ -74,12 +83,14 @@ impl Stage {
 impl Snapshotter {
     pub(in crate::log) fn new(settings: &Arc<Settings>, shared: &Arc<Shared>) -> Snapshotter {
         let (settings, shared) = (Arc::clone(settings), Arc::clone(shared));
-        Snapshotter { settings, shared, known: None, stage: Stage::idle() }
+        let (known, stage) = (None, Stage::idle());
+        Snapshotter { settings, shared, known, bytes: 0, freed: 0, stage }
     }
 
     /// What was under way has ended with the last session.
     pub(in crate::log) fn begin_session(&mut self) {
         self.stage = Stage::idle();
+        self.freed = 0;
         self.doubt();
     }
 
@@ -109,8 +120,16 @@ impl Snapshotter {
             // A snapshot that was known before is no newer now.
             let same = self.known.as_ref().filter(|known| known.pointer == pointer);
             let since = same.map_or_else(Instant::now, |known| known.since);
+            if same.is_none() {
+                self.bytes = 0;
+            }
             self.known = Some(Known { revision, pointer, since });
         }
+    }
+
+    /// A message of this many bytes was applied.
+    pub(in crate::log) fn applied(&mut self, bytes: usize) {
+        self.bytes += bytes as u64;
     }
 
     /// Requests the lease if a snapshot is due.
@@ -135,7 +154,32 @@ impl Snapshotter {
         let steps = state.steps.saturating_sub(pointer.newest.steps);
         let is_old = now.saturating_duration_since(*since) >= SNAPSHOT_AFTER;
         steps >= self.settings.snapshot_steps
+            || self.bytes >= self.settings.snapshot_bytes
+                && self.bytes >= SNAPSHOT_CONTENTS * state.contents_bytes()
             || is_old && state.place.sequence > pointer.newest.sequence
+    }
+
+    /// The servers have no room for further messages. Removes those that the newest snapshot replaces, once
+    /// in a session: otherwise they stay until there is a newer one.
+    pub(in crate::log) fn make_room(&mut self, background: &Background) {
+        let Some(Known { pointer, .. }) = &self.known else { return };
+        let newest = pointer.newest.clone();
+        if newest.sequence > self.freed {
+            self.freed = newest.sequence;
+            background.spawn(|store| async move { Report::Freed(store.make_room(&newest).await) });
+        }
+    }
+
+    /// Messages were removed to make room, or could not be: the next session tries it again.
+    pub(in crate::log) fn freed(&self, freed: Result<u64, String>) {
+        let reason = match freed {
+            Ok(0) => return,
+            Ok(count) => {
+                format!("no room for messages: removed {count} before the newest snapshot")
+            }
+            Err(error) => format!("no room for messages: none was removed: {error}"),
+        };
+        self.shared.event(Event::new("log_error", &[("reason", &reason)]));
     }
 
     /// The lease was refused: another node takes a snapshot.

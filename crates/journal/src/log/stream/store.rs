@@ -254,8 +254,13 @@ impl Store {
         state: &mut State,
     ) -> Result<(), End> {
         let place = Place { sequence: snapshot.sequence, stored: snapshot.stored };
+        Ok(state.load(&self.read(snapshot).await?, place)?)
+    }
+
+    /// The bytes of a snapshot, if they have its digest.
+    async fn read(&self, snapshot: &Snapshot) -> Result<Vec<u8>, End> {
         let damaged = |what: String| {
-            let text = format!("the snapshot at sequence {}: {what}", place.sequence);
+            let text = format!("the snapshot at sequence {}: {what}", snapshot.sequence);
             End::Fatal(LogError::Snapshot(text))
         };
         let missing = |error: object_store::GetError| match error.kind() {
@@ -279,7 +284,17 @@ impl Store {
             let expected = &snapshot.digest;
             return Err(damaged(format!("its digest is {digest}, expected is {expected}")));
         }
-        Ok(state.load(&bytes, place)?)
+        Ok(bytes)
+    }
+
+    /// Removes the messages before this snapshot. Returns how many there were.
+    ///
+    /// # Errors
+    /// The reason, also if the snapshot is damaged: nothing was removed then.
+    pub(in crate::log) async fn make_room(&self, newest: &Snapshot) -> Result<u64, String> {
+        self.read(newest).await.map_err(End::reason)?;
+        let purged = self.stream.purge().sequence(newest.sequence).await;
+        Ok(purged.map_err(|error| error.to_string())?.purged)
     }
 
     /// Whether this node may take a snapshot now.
