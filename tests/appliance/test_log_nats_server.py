@@ -16,6 +16,7 @@ import threading
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -23,6 +24,7 @@ import pytest
 import holdfast
 from holdfast.appliance import Appliance
 from holdfast.config import load
+from holdfast.net.nats_server import Access
 from holdfast.net.nats_server import folder as nats_folder
 from holdfast.net.nats_server.folder import Folder as NatsFolder
 from holdfast.net.nats_server.log import ServerLog
@@ -142,21 +144,53 @@ def test_a_server_whose_disk_was_full_is_started_again_when_it_has_room(
 
 
 @pytest.mark.parametrize(
-    ("text", "times"),
+    ("text", "expected"),
     [
-        ("Filestore [s] Critical write error: no space left on device", 1),
-        ("JetStream stream '$G > s' critical write error: no space left on device", 1),
-        ("JetStream failed to store a msg on stream '$G > s': input/output error", 1),
-        ("JetStream file resource limits exceeded for server", 1),
-        ("127.0.0.1:5000 - cid:5 - authentication error", 0),
+        ("Filestore [s] Critical write error: no space left on device", ["failed"]),
+        ("JetStream stream '$G > s' critical write error: no space left on device", ["failed"]),
+        ("JetStream failed to store a msg on stream '$G > s': input/output error", ["failed"]),
+        ("JetStream file resource limits exceeded for server", ["full"]),
+        ("127.0.0.1:5000 - cid:5 - authentication error", []),
     ],
+    ids=["disk", "stream", "message", "limit", "other"],
 )
-def test_lines_that_say_that_the_server_refuses_writes_are_found(text: str, times: int) -> None:
+def test_lines_that_say_that_the_server_refuses_writes_are_found(
+    text: str, expected: list[str]
+) -> None:
     found: list[str] = []
-    log = ServerLog(refuses=lambda: found.append(text))
+    log = ServerLog(failed=lambda: found.append("failed"), full=lambda: found.append("full"))
     for line in (f"[ERR] {text}", "[INF] Server is ready", f"[ERR] {text}"):
         log.take(f"[9] 2026/11/27 14:05:11.538896 {line}")
-    assert len(found) == times
+    assert found == expected
+
+
+def test_a_server_may_store_no_less_after_a_restart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = NatsFolder(tmp_path / "log")
+    access = Access("127.0.0.1", 4222, token_file=tmp_path / "log" / "token")
+    disk, stored = 400 << 20, tmp_path / "log" / "store" / "1.blk"
+    stored.parent.mkdir()
+    stored.touch()
+
+    def free(_: Path) -> SimpleNamespace:
+        return SimpleNamespace(free=disk - stored.stat().st_size)
+
+    def limit() -> int:
+        settings = json.loads(folder.configured(access).read_text())
+        return int(settings["jetstream"]["max_file_store"]) >> 20
+
+    monkeypatch.setattr(shutil, "disk_usage", free)
+    assert limit() == 300
+    assert not folder.may_grow()
+    os.truncate(stored, 300 << 20)
+    assert folder.may_grow()
+    assert limit() == 375
+    os.truncate(stored, 375 << 20)
+    assert not folder.may_grow(), "a server that is full is not restarted again and again"
+    disk *= 2
+    assert folder.may_grow(), "there is room again"
+    folder.close()
 
 
 def failed_writes(caplog: pytest.LogCaptureFixture) -> list[str]:

@@ -13,7 +13,8 @@ _LINE = re.compile(r"\[\d+\] [\d/]+ [\d:.]+ \[(?P<level>[A-Z]{3})\] ?(?P<text>.*
 _LEVELS = {"INF": logging.DEBUG, "WRN": logging.WARNING, "ERR": logging.ERROR, "FTL": logging.ERROR}
 _LISTENING = "Listening for client connections on "
 _READY = "Server is ready"
-_REFUSES = re.compile("[Cc]ritical write error|failed to store a msg|resource limits exceeded")
+_FAILED = re.compile("[Cc]ritical write error|failed to store a msg")
+_FULL = "resource limits exceeded"
 
 
 class ServerLog:
@@ -22,13 +23,15 @@ class ServerLog:
     def __init__(
         self,
         take: Callable[[int, str], None] | None = None,
-        refuses: Callable[[], None] | None = None,
+        failed: Callable[[], None] | None = None,
+        full: Callable[[], None] | None = None,
     ) -> None:
         """`take` gets the level and the text of each line.
 
-        `refuses` is called for each line that says that a server which is ready refuses writes.
+        `failed` is called for each line that says that a server which is ready could not write,
+        `full` for each that says that it has stored as much as it may.
         """
-        self._take, self._refuses = take, refuses
+        self._take, self._failed, self._full = take, failed, full
         self.begin()
 
     def begin(self) -> None:
@@ -52,5 +55,7 @@ class ServerLog:
         self.is_ready = self.is_ready or text == _READY
         if self._take is not None:
             self._take(level, text)
-        if self._refuses is not None and self.is_ready and _REFUSES.search(text):
-            self._refuses()
+        if self._failed is not None and self.is_ready and _FAILED.search(text):
+            self._failed()
+        if self._full is not None and self.is_ready and _FULL in text:
+            self._full()

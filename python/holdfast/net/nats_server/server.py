@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import shutil
 import sysconfig
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from holdfast.events import log_lines
@@ -59,7 +60,7 @@ class NatsServer:
             self._child = ChildProcess(
                 f"holdfast-nats-{self._name}",
                 [program, "-c", str(self._folder.configured(self._access))],
-                ServerLog(self._pass_on, self._refuses),
+                ServerLog(self._pass_on, self._failed, self._full),
                 restarts=Backoff(FIRST_PAUSE_S, MAX_PAUSE_S, jitter=False, proven_s=PROVEN_S),
                 ended=self._ended,
                 inherited=self._folder.inherited,
@@ -92,16 +93,28 @@ class NatsServer:
             logging.ERROR, "log_server_ended", log=self._name, error=reason, pause=pause
         )
 
-    def _refuses(self) -> None:
+    def _failed(self) -> None:
         """Restarts the server if its disk has room again.
 
-        After a write error, and when it has stored 3/4 of what was free at its start, nats-server
-        refuses writes until it is restarted. It logs that again and again while nodes write.
+        After a write error, nats-server refuses writes until it is restarted. It logs that again
+        and again while nodes write.
         """
         assert self._folder is not None
         assert self._child is not None
         if self._folder.has_room():
             self._child.terminate()
+
+    def _full(self) -> None:
+        """Restarts the server if it may then store more, as after files of others were removed.
+
+        Otherwise it takes writes again when the nodes have removed messages behind a snapshot.
+        """
+        assert self._folder is not None
+        assert self._child is not None
+        with suppress(OSError):
+            if self._folder.may_grow():
+                self._folder.configured(self._access)
+                self._child.terminate()
 
     def _pass_on(self, level: int, text: str) -> None:
         """Logs a line of the server's log."""
