@@ -533,6 +533,30 @@ fn fill(server: &Server) {
     });
 }
 
+/// The servers may only be cut off from those that have the log. And a new stream would hide that it is lost.
+#[test]
+fn a_node_that_runs_makes_no_stream_in_place_of_a_lost_one() {
+    let server = Server::new();
+    let node = Node::started(&[&server], "a");
+    let other = Node::new(&[&server], "b", |settings| settings.max_cut_off = Duration::ZERO);
+    other.start();
+    node.write(0, 42).unwrap();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let jetstream = runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        jetstream.delete_stream("holdfast-log-site").await.unwrap();
+        jetstream
+    });
+    until("both notice it", || {
+        let error = node.status().last_error.unwrap_or_default();
+        error.contains("do not have the stream of the log any more") && other.failure().is_some()
+    });
+    assert_eq!(other.failure().unwrap().kind(), "replaced");
+    assert_eq!((node.read(0), other.read(0)), (Ok(42), Err(Refusal::Differs)));
+    assert!(runtime.block_on(jetstream.get_stream("holdfast-log-site")).is_err());
+}
+
 /// Whoever may delete what the log keeps beside its steps can't make it unusable while a node runs.
 #[test]
 fn snapshots_are_stored_again_after_a_bucket_of_the_log_was_deleted() {

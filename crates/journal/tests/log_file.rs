@@ -231,6 +231,12 @@ fn a_new_log_under_the_same_name_is_not_that_of_the_file() {
     let node = KeptNode::started(&Server::new(), &path);
     node.stop();
     let empty = Server::new();
+    let node = KeptNode::new(&empty, &path, |settings| settings.max_cut_off = Duration::ZERO);
+    let error = node.node.try_start().unwrap_err();
+    assert_eq!(error.kind(), "replaced");
+    assert!(error.to_string().contains("they have lost it. The contents"), "{error}");
+    node.stop();
+    Node::started(&[&empty], "b");
     let node = KeptNode::new(&empty, &path, |_| {});
     let error = node.node.try_start().unwrap_err();
     assert!(error.to_string().contains("was deleted and made anew. The contents"), "{error}");

@@ -19,7 +19,7 @@ use crate::log::parts::background::{Background, Report};
 use crate::log::parts::comparer::Replayed;
 use crate::log::parts::node::{CHECK_INTERVAL, Node};
 use crate::log::parts::sender::{Acknowledged, Publisher};
-use crate::log::parts::session_start::join;
+use crate::log::parts::session_start::{join, lags};
 use crate::log::state::{Applied, digest_of};
 use crate::log::status::{Event, Phase};
 use crate::log::stream::connection::{Connected, REQUEST_TIMEOUT, connect};
@@ -391,6 +391,12 @@ async fn open_store(node: &mut Node, client: &Client) -> Result<Store, End> {
     let mut context: Context = jetstream::new(client.clone());
     context.set_timeout(REQUEST_TIMEOUT);
     let (settings, fingerprint) = (Arc::clone(&node.settings), node.fingerprint.clone());
+    // A node that has applied something makes no new stream in place of the one that is missing.
+    let is_known = node.applier.stream_id().is_some();
+    if is_known && node.run_with_expiry(Store::is_missing(&context, &settings)).await?? {
+        let text = "the servers do not have the stream of the log any more: they have lost it";
+        return Err(lags(node, text.to_owned()));
+    }
     node.run_with_expiry(Store::open(&context, &settings, &fingerprint, true)).await?
 }
 

@@ -44,7 +44,7 @@ pub(in crate::log) async fn join(node: &mut Node, store: &Store) -> Result<u64, 
 }
 
 /// The servers know less than this node.
-fn lags(node: &mut Node, text: String) -> End {
+pub(in crate::log) fn lags(node: &mut Node, text: String) -> End {
     let error = node.applier.replaced(text);
     node.lag.judge(error)
 }

@@ -159,6 +159,18 @@ impl Store {
         Ok(Store { context: context.clone(), stream, keys: pointers, leases, objects })
     }
 
+    /// Whether the servers do not have the stream of the log.
+    pub(in crate::log) async fn is_missing(
+        context: &Context,
+        settings: &Settings,
+    ) -> Result<bool, End> {
+        match context.get_stream(stream_name(&settings.name)).await {
+            Ok(_) => Ok(false),
+            Err(error) if is_missing(&error.kind()) => Ok(true),
+            Err(error) => Err(End::lost("the stream of the log", error)),
+        }
+    }
+
     /// Tells the stream from another one with the same name.
     pub(in crate::log) fn id(&self) -> Option<&str> {
         self.stream.cached_info().config.metadata.get(META_ID).map(String::as_str)
