@@ -303,6 +303,52 @@ def test_replies_have_the_order_of_their_requests(device: Stream, run: Run) -> N
     ]
 
 
+@pytest.mark.parametrize("kind", ["tcp", "udp"])
+def test_a_write_that_is_sent_again_before_its_reply_reaches_the_device_once(
+    device: Stream, run: Run, tmp_path: Path, kind: str
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, kind=kind, audit={"file": "audit.log"}))
+    write = wire.frame(WRITE, transaction=7)
+    with client(kind, scada(appliance)) as other, client(kind, scada(appliance)) as front:
+        other.send(wire.frame(READ))
+        device.await_requests(1)
+        for sent in (write, write, write, wire.frame(SIXTH, transaction=8)):
+            front.send(sent)
+        await_count(appliance, "waiting", 3)
+        held.release()
+        replies = [(reply.transaction, reply.pdu) for reply in (front.receive() for _ in range(4))]
+        assert sorted(replies) == [(7, WRITE), (7, WRITE), (7, WRITE), (8, SIX)]
+        assert [asked.pdu for asked in device.requests] == [READ, WRITE, SIXTH]
+
+        front.send(write)
+        assert front.receive().pdu == WRITE, "it is answered, so the same write is a new one"
+    assert [asked.pdu for asked in device.requests] == [READ, WRITE, SIXTH, WRITE]
+    assert [line["outcome"] for line in await_writes(tmp_path / "audit.log", 2)] == ["done"] * 2
+
+
+@pytest.mark.parametrize("kind", ["tcp", "udp"])
+def test_a_client_with_one_transaction_id_for_all_may_return_to_an_earlier_value(
+    device: Stream, run: Run, kind: str
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, kind=kind, link={"coalesce": False}))
+    other = bytes.fromhex("0600054321")
+    requests = [WRITE, other, WRITE, SIXTH, SIXTH]
+    with client(kind, scada(appliance)) as front:
+        for request in requests:
+            front.send(wire.frame(request))
+        device.await_requests(1)
+        await_count(appliance, "waiting", 5)
+        held.release()
+        replies = [front.receive().pdu for _ in requests]
+
+    assert sorted(replies) == sorted([WRITE, other, WRITE, SIX, SIX])
+    assert [asked.pdu for asked in device.requests] == requests
+
+
 @pytest.mark.parametrize("kind", ["rtu", "ascii", "rtu-udp"])
 def test_a_client_without_transaction_ids_that_asks_again_gets_no_earlier_reply(
     device: Stream, run: Run, kind: str

@@ -25,6 +25,7 @@ from support.cli import RunCommand
 from support.config_folder import written
 from support.fake_device import Asked, Stream, exception, good
 from support.polled import configuration, counters, device, read, until_polled
+from support.routed import Held
 from support.running import endpoint, log_events
 
 if TYPE_CHECKING:
@@ -135,6 +136,19 @@ def test_a_write_reaches_the_device_and_then_memory(name: str, listener: str, ru
             assert scada.read_holding_registers(10, 3) == after
         assert writes_of(source) == [sent]
         assert result in (None, after)
+
+
+def test_a_write_that_is_sent_again_before_its_reply_reaches_the_device_once(run: Run) -> None:
+    held = Held()
+    with plc() as source:
+        appliance = started(run, source)
+        source.script = [*[good] * len(source.requests), held]
+        with wire.Connection(endpoint(appliance, "scada")) as scada:
+            scada.send(3 * wire.frame(b"\x06\x00\x0b\x00\x07"))
+            wire.until(lambda: writes_of(source), "the write is passed on")
+            held.release()
+            assert len(scada.receive_many(3)) == 3
+        assert len(writes_of(source)) == 1
 
 
 def test_coils_reach_the_device_and_then_memory(run: Run) -> None:

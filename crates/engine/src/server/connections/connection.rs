@@ -448,7 +448,12 @@ impl<F: Framing> Answering<F> {
                         let deferred = self.deferred.get_or_insert_default();
                         let ours = (&*self.unit_server, &*self.rights, &*self.context);
                         let request = (tag, unit_id, pdu);
-                        match deferred.defer(ours, place, self.peer.ip(), request) {
+                        let deferral = if F::HAS_IDS && deferred.repeats(request) {
+                            Deferral::Later(None)
+                        } else {
+                            deferred.defer(ours, place, self.peer.ip(), request)
+                        };
+                        match deferral {
                             Deferral::Later(refused) => {
                                 self.context.note_refused(
                                     refused,
@@ -528,13 +533,16 @@ impl<F: Framing> Answering<F> {
     fn collect(&mut self, context: &mut Context<'_>, output: &mut [u8]) -> Option<usize> {
         let deferred = self.deferred.as_mut()?;
         let mut len = None;
-        while let Poll::Ready((asked, reply)) = deferred.poll_next(&self.unit_server, context) {
+        while let Poll::Ready((asked, reply, times)) =
+            deferred.poll_next(&self.unit_server, context)
+        {
             let (tag, unit_id) = (asked.tag, asked.unit_id);
             asked.record(&self.context, Some(&self.peer), &reply);
             let at = len.get_or_insert(0);
-            let frame = &mut output[*at..];
             let pdu = &reply.pdu[..];
-            if !pdu.is_empty() {
+            let times = if pdu.is_empty() { 0 } else { times };
+            for _ in 0..times {
+                let frame = &mut output[*at..];
                 frame[F::HEADER_LEN..][..pdu.len()].copy_from_slice(pdu);
                 *at += F::complete(frame, tag, unit_id, pdu.len());
             }

@@ -23,6 +23,7 @@ use crate::server::connections::peer::Peer;
 use crate::server::reports::audit::{Forwarded, Permit};
 use crate::server::reports::refused_request::RefusedRequest;
 use crate::server::requests::unit_server::UnitServer;
+use crate::server::rights::functions::only_reads;
 use crate::server::rights::peer_rights::PeerRights;
 use crate::server::rights::rule::Elsewhere;
 
@@ -40,6 +41,8 @@ pub(in crate::server) struct Deferred {
 pub(in crate::server) struct Waiting {
     asked: Asked,
     reply: Expected,
+    /// How often it was sent. Each time is answered, as by a device.
+    times: usize,
     /// Whether a journal carries it out. Those of a connection are carried out in their order.
     is_step: bool,
 }
@@ -89,6 +92,25 @@ impl Deferred {
         !self.unread.is_empty()
     }
 
+    /// Whether a request is the newest one of its transaction id, sent again before its reply: then it gets
+    /// the same reply. Passed on, it could undo a later write of another client. Reads are harmless. An older
+    /// one does not count: a client may use one id for all requests, and return to an earlier value.
+    pub(in crate::server) fn repeats(&mut self, (tag, unit_id, request): (u16, u8, &[u8])) -> bool {
+        let has_room = self.has_room();
+        let newest = self.waiting.iter_mut().rev().find(|waiting| waiting.asked.tag == tag);
+        let Some(waiting) = newest.filter(|Waiting { asked, .. }| {
+            has_room && asked.unit_id == unit_id && asked.request == request && !only_reads(request)
+        }) else {
+            return false;
+        };
+        waiting.times += 1;
+        true
+    }
+
+    fn has_room(&self) -> bool {
+        self.waiting.iter().map(|waiting| waiting.times).sum::<usize>() < MAX_WAITING
+    }
+
     /// Sends a request on its way, if its unit is elsewhere and there is room.
     pub(in crate::server) fn defer(
         &mut self,
@@ -100,12 +122,11 @@ impl Deferred {
         let place = match place {
             // Without a request before it, nothing can reorder its effects.
             None if self.is_empty() => return Deferral::Now,
-            Some(place @ Elsewhere::Device(_)) if self.waiting.len() < MAX_WAITING => place,
+            Some(place @ Elsewhere::Device(_)) if self.has_room() => place,
             // A write to a mirror also changes the memory, which requests before it may read or write.
             Some(place @ Elsewhere::Mirror(_)) if self.is_empty() => place,
             Some(place @ Elsewhere::Journal(_))
-                if self.waiting.len() < MAX_WAITING
-                    && self.waiting.iter().all(|waiting| waiting.is_step) =>
+                if self.has_room() && self.waiting.iter().all(|waiting| waiting.is_step) =>
             {
                 place
             }
@@ -117,7 +138,7 @@ impl Deferred {
                 unit_server.forward(rights, place, &asker, unit_id, request, permit)
             });
         let is_step = matches!(place, Elsewhere::Journal(_));
-        self.waiting.push_back(Waiting { asked, reply, is_step });
+        self.waiting.push_back(Waiting { asked, reply, times: 1, is_step });
         Deferral::Later(refused)
     }
 
@@ -148,12 +169,12 @@ impl Deferred {
         unread.len()
     }
 
-    /// The next reply, once it is there.
+    /// The next reply, once it is there, and how often it is sent.
     pub(in crate::server) fn poll_next(
         &mut self,
         unit_server: &UnitServer,
         context: &mut Context<'_>,
-    ) -> Poll<(Asked, Reply)> {
+    ) -> Poll<(Asked, Reply, usize)> {
         let Some(first) = self.waiting.front_mut() else { return Poll::Pending };
         let reply = match &mut first.reply {
             Expected::Known(reply) => std::mem::take(reply),
@@ -163,7 +184,7 @@ impl Deferred {
             },
         };
         let first = self.waiting.pop_front().expect("there is a first request");
-        Poll::Ready((first.asked, reply))
+        Poll::Ready((first.asked, reply, first.times))
     }
 }
 

@@ -21,9 +21,10 @@ use crate::link::{Asker, source};
 use crate::server::connections::deadlines::BURST_TIME;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
-use crate::server::connections::reply_order::{Asked, Expected};
+use crate::server::connections::reply_order::{Asked, Expected, MAX_WAITING};
 use crate::server::reports::refused_request::Reported;
 use crate::server::requests::unit_server::{UnitServer, UnitSettings};
+use crate::server::rights::functions::only_reads;
 use crate::server::rights::policy::Policy;
 use crate::server::rights::rule::Rule;
 use crate::server::transports::framing::{Datagram, Mbap, Next, Rtu};
@@ -197,6 +198,9 @@ impl ModbusUdp {
         if let Some(newest) = later.newest.get_mut(&peer) {
             newest.0 = Instant::now();
         }
+        if D::HAS_IDS && later.repeats(peer, (tag, unit_id, request)) {
+            return 0;
+        }
         if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
             let asker = later.asker(peer.ip());
             let asked = Asked::send(context, place, (tag, unit_id, request), |permit| {
@@ -216,6 +220,8 @@ impl ModbusUdp {
                     later.begin(&asker, (peer, now), async move {
                         Completed { meta, asked: now, tag, unit_id, pdu: reply.await.pdu }
                     });
+                    let sent = Sent { asked: now, unit_id, request: request.to_vec(), times: 1 };
+                    later.sent.insert((peer, tag), sent);
                     0
                 }
                 Expected::Known(reply) => {
@@ -238,9 +244,19 @@ struct Later {
     clients: HashMap<IpAddr, Client>,
     /// For each peer that waits, when its newest request came, and for how many replies it waits.
     newest: HashMap<SocketAddr, (Instant, usize)>,
+    /// By peer and transaction id, the newest request that waits for its reply.
+    sent: HashMap<(SocketAddr, u16), Sent>,
     replies: JoinSet<Completed>,
     /// The engine waits until it is dropped.
     running: watch::Receiver<bool>,
+}
+
+struct Sent {
+    asked: Instant,
+    unit_id: u8,
+    request: Vec<u8>,
+    /// How often it was sent. Each time is answered, as by a device.
+    times: usize,
 }
 
 /// All requests from one address: a client may send each from another port.
@@ -251,8 +267,8 @@ struct Client {
 
 impl Later {
     fn new(running: watch::Receiver<bool>) -> Later {
-        let (clients, newest) = (HashMap::new(), HashMap::new());
-        Later { clients, newest, replies: JoinSet::new(), running }
+        let (clients, newest, sent) = (HashMap::new(), HashMap::new(), HashMap::new());
+        Later { clients, newest, sent, replies: JoinSet::new(), running }
     }
 
     fn asker(&self, address: IpAddr) -> Asker {
@@ -280,6 +296,26 @@ impl Later {
         self.clients.entry(peer.ip()).or_insert(client).waiting += 1;
         self.newest.entry(peer).or_insert((now, 0)).1 += 1;
         self.replies.spawn(completed);
+    }
+
+    /// Whether a peer sends a request again before its reply, as on a
+    /// [connection](crate::server::connections::reply_order::Deferred::repeats).
+    fn repeats(&mut self, peer: SocketAddr, (tag, unit_id, request): (u16, u8, &[u8])) -> bool {
+        let Some(sent) = self.sent.get_mut(&(peer, tag)).filter(|sent| {
+            sent.unit_id == unit_id && sent.request == request && !only_reads(request)
+        }) else {
+            return false;
+        };
+        sent.times = (sent.times + 1).min(MAX_WAITING);
+        true
+    }
+
+    /// How often the reply to what a peer asked at that time is sent.
+    fn times(&mut self, peer: SocketAddr, tag: u16, asked: Instant) -> usize {
+        match self.sent.entry((peer, tag)) {
+            Entry::Occupied(sent) if sent.get().asked == asked => sent.remove().times,
+            _ => 1,
+        }
     }
 
     /// A reply has come to what a peer asked at that time. Returns whether the peer has asked again after a
@@ -316,11 +352,12 @@ struct Completed {
 fn complete<D: Datagram>(socket: &Datagrams, completed: Completed, later: &mut Later) {
     let Completed { meta, asked, tag, unit_id, pdu } = completed;
     let is_late = later.end(meta.addr, asked);
+    let times = later.times(meta.addr, tag, asked);
     if !pdu.is_empty() && (D::HAS_IDS || !is_late) {
         let mut frame = [0; MAX_FRAME_LEN];
         frame[D::HEADER_LEN..][..pdu.len()].copy_from_slice(&pdu);
         let len = D::complete(&mut frame, tag, unit_id, pdu.len());
-        socket.send(&frame[..len], &meta);
+        (0..times).for_each(|_| socket.send(&frame[..len], &meta));
     }
 }
 
