@@ -1397,12 +1397,13 @@ class Fence:
 
 @final
 class Link:
-    """A connection or serial line to devices, shared by all that ask them."""
+    """A connection or serial line to devices, shared by all that ask them.
 
-    @property
-    def name(self) -> str:
-        """The name that it was created with."""
+    Two are equal if they are the same connection or line.
+    """
 
+    def __eq__(self, other: object) -> bool: ...
+    def __hash__(self) -> int: ...
     @property
     def error(self) -> str | None:
         """Why requests of clients fail: its address can't be reached, or several had no answer.
@@ -1561,7 +1562,6 @@ class Poller:
 
     def link(
         self,
-        name: str,
         endpoint: Endpoint,
         *,
         in_flight: int | None = 1,
@@ -1581,7 +1581,7 @@ class Poller:
         Raises `ValueError`, and `RuntimeError` after `stop`.
         """
 
-    def known_link(self, name: str, endpoint: Endpoint) -> Link | None:
+    def known_link(self, endpoint: Endpoint) -> Link | None:
         """The link to an address that a device or another link uses, with the same certificates.
 
         Returns `None` if none does. Raises `RuntimeError` after `stop`.

@@ -9,6 +9,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from holdfast.adapters.rest.operations import document
+from holdfast.config import load
 from holdfast.events import log_lines
 from support import web, wire
 from support.fake_device import Stream, exception, silent
@@ -17,6 +18,7 @@ from support.running import endpoint
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from holdfast.appliance import Appliance
     from support.running import Run
@@ -138,6 +140,40 @@ def test_the_log_has_why_a_link_fails_once_and_that_it_works_again(
         assert counters(appliance)["error"] is None
 
 
+@pytest.mark.parametrize("moves", ["to the address of the other", "away"])
+def test_a_reload_names_a_link_after_the_device_that_is_behind_it_then(
+    run: Run, records: web.Records, tmp_path: Path, moves: str
+) -> None:
+    """Also if the device that it was named after is behind another link now."""
+
+    def written(pump: Stream, valve: Stream) -> str:
+        devices = {"pump": {"url": pump.url, "unit": 1}, "valve": {"url": valve.url, "unit": 1}}
+        units: dict[int | str, Any] = {1: {"route": "pump"}, 2: {"route": "valve"}}
+        return configuration("tcp://127.0.0.1:1", units=units, devices=devices)
+
+    with Stream("tcp") as first, Stream("tcp") as second, Stream("tcp") as third:
+        appliance = run(written(first, second))
+        for unit in (1, 2):
+            assert ask(appliance, READ, unit) == FIVE
+        file = tmp_path / "moved.yaml"
+        file.write_text(written(third if moves == "away" else second, first))
+        appliance.reload(load(file))
+        for unit in (1, 2):
+            assert ask(appliance, READ, unit) == FIVE
+        first.stop()
+        wire.until(lambda: ask(appliance, READ, 2) == exception(READ, 0x0A), "the device is gone")
+        appliance.log_events(timeout=0)
+
+        [down] = records.of("link_down")
+        assert (down["link"], first.url in down["error"]) == ("valve", True)
+        links = appliance.diagnostics.stats()["links"]
+        assert {name: link["error"] is None for name, link in links.items()} == {
+            "bus": True,
+            "pump": True,
+            "valve": False,
+        }
+
+
 def test_the_log_has_that_a_device_does_not_answer(run: Run, records: web.Records) -> None:
     with Stream("tcp", then=silent) as device:
         appliance = run(configuration(device.url, link={"timeout": 0.1}))
@@ -147,10 +183,13 @@ def test_the_log_has_that_a_device_does_not_answer(run: Run, records: web.Record
             assert len(records.of("link_down")) == number // 2
 
 
-def test_the_log_has_that_a_queue_was_full(device: Stream, run: Run, records: web.Records) -> None:
+def test_the_log_has_that_a_queue_was_full(
+    device: Stream, run: Run, records: web.Records, tmp_path: Path
+) -> None:
     held = Held()
     device.script = [held]
-    appliance = run(configuration(device.url, link={"queue": 1}))
+    text = configuration(device.url, link={"queue": 1})
+    appliance = run(text)
     with wire.Connection(endpoint(appliance, "scada")) as first:
         first.send(wire.frame(READ))
         device.await_requests(1)
@@ -161,6 +200,11 @@ def test_the_log_has_that_a_queue_was_full(device: Stream, run: Run, records: we
         held.release()
         assert first.receive().pdu == FIVE
 
+    file = tmp_path / "renamed.yaml"
+    file.write_text(text.replace('"bus"', '"line"'))
+    appliance.reload(load(file))
+    assert counters(appliance, "line")["refused_full"] == 1
+    appliance.log_events(timeout=0)
     assert [(each["link"], each["count"]) for each in records.of("link_full")] == [("bus", 1)]
 
 

@@ -101,7 +101,7 @@ def to_rtu_server(
         poller = _core.Poller([])
         stack.callback(poller.stop)
         target = parse(f"rtu://{cable.devices[1]}?parity=none&baud=4000000")
-        route = poller.link("line", endpoint(target)).route("line", timeout=wire.DEADLINE)
+        route = poller.link(endpoint(target)).route("line", timeout=wire.DEADLINE)
         rules = [
             _core.Rule({unit: behind}, sources=LOOPBACK, access="read-write")
             for unit, behind in ((1, route), (1, memory))

@@ -39,7 +39,6 @@ pub(crate) fn retry(pauses: Option<(f64, f64)>) -> PyResult<Retry> {
 
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 pub(crate) fn settings(
-    name: String,
     endpoint: &Endpoint,
     (number, pauses): (Option<i128>, Option<(f64, f64)>),
     queue: Option<i128>,
@@ -52,7 +51,6 @@ pub(crate) fn settings(
         text.parse::<IpAddr>().map(|peer| peer.to_canonical()).map_err(|_| invalid())
     };
     Ok(LinkSettings {
-        name,
         endpoint: endpoint.core.clone(),
         in_flight: in_flight(number)?,
         retry: retry(pauses)?,
@@ -72,6 +70,14 @@ pub struct Link {
 
 #[pymethods]
 impl Link {
+    fn __eq__(&self, other: PyRef<'_, Link>) -> bool {
+        Arc::ptr_eq(&self.core, &other.core)
+    }
+
+    fn __hash__(&self) -> usize {
+        Arc::as_ptr(&self.core).addr()
+    }
+
     #[pyo3(signature = (name, *, timeout, unit=None))]
     fn route(&self, name: &str, timeout: f64, unit: Option<i128>) -> PyResult<Route> {
         let core = CoreRoute {
@@ -99,11 +105,6 @@ impl Link {
     ) -> PyResult<Option<u64>> {
         let (unit_id, timeout) = (byte("unit", unit)?, seconds("timeout", timeout)?);
         Ok(self.core.call(&caller.core, unit_id, &request.encoded, timeout, broadcast))
-    }
-
-    #[getter]
-    fn name(&self) -> &str {
-        &self.core.name
     }
 
     #[getter]

@@ -166,11 +166,10 @@ impl Poller {
         Results { core: self.core.receiver() }
     }
 
-    #[pyo3(signature = (name, endpoint, *, in_flight=1, queue=None, coalesce=true, cache=0.0, preferred=None, retry=None))]
+    #[pyo3(signature = (endpoint, *, in_flight=1, queue=None, coalesce=true, cache=0.0, preferred=None, retry=None))]
     #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
     fn link(
         &self,
-        name: String,
         endpoint: PyRef<'_, Endpoint>,
         in_flight: Option<i128>,
         queue: Option<i128>,
@@ -181,13 +180,12 @@ impl Poller {
     ) -> PyResult<Link> {
         let preferred = preferred.unwrap_or_default();
         let settings =
-            link::settings(name, &endpoint, (in_flight, retry), queue, coalesce, cache, preferred)?;
+            link::settings(&endpoint, (in_flight, retry), queue, coalesce, cache, preferred)?;
         Ok(Link { core: self.core.link(settings).map_err(raised)? })
     }
 
-    fn known_link(&self, name: String, endpoint: PyRef<'_, Endpoint>) -> PyResult<Option<Link>> {
-        let settings =
-            link::settings(name, &endpoint, (Some(1), None), None, true, 0.0, Vec::new())?;
+    fn known_link(&self, endpoint: PyRef<'_, Endpoint>) -> PyResult<Option<Link>> {
+        let settings = link::settings(&endpoint, (Some(1), None), None, true, 0.0, Vec::new())?;
         let known = self.core.known_link(settings).map_err(raised)?;
         Ok(known.map(|core| Link { core }))
     }

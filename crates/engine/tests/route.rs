@@ -133,7 +133,6 @@ impl Setup {
         let poller = Poller::start(Vec::new()).unwrap();
         let place = Place::RtuOverTcp { host: "127.0.0.1".into(), port: device.port() };
         let link = LinkSettings {
-            name: "device".into(),
             endpoint: place.into(),
             in_flight: InFlight::Fixed(1),
             retry: Retry::default(),

@@ -92,15 +92,15 @@ class Shared:
     def _known_link(self, target: NetworkTarget) -> Link | None:
         """Returns the link to a target that the appliance uses now."""
         if target.transport != "tls":
-            return self._poller.known_link(*_plain_endpoint(target))
+            return self._poller.known_link(_plain_endpoint(target))
         known = self._endpoints.get(target)
-        return None if known is None else self._poller.known_link(str(target), known[0])
+        return None if known is None else self._poller.known_link(known[0])
 
 
 @lru_cache(MAX_ENDPOINTS)
-def _plain_endpoint(target: NetworkTarget) -> tuple[str, Endpoint]:
-    """The name and the endpoint of a target without TLS. Each request asks for its link."""
-    return str(target), endpoint(target)
+def _plain_endpoint(target: NetworkTarget) -> Endpoint:
+    """The endpoint of a target without TLS. Each request asks for its link."""
+    return endpoint(target)
 
 
 class Turns:

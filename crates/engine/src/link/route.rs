@@ -24,7 +24,6 @@ use crate::link::scheduling::write_barrier::InOrder;
 /// Settings of a link that listeners or event loops use.
 #[derive(Debug, Clone)]
 pub struct LinkSettings {
-    pub name: String,
     pub endpoint: Endpoint,
     /// Requests in flight, over TCP.
     pub in_flight: InFlight,
@@ -74,7 +73,6 @@ counters! {
 /// The sending side of a link.
 #[derive(Debug)]
 pub struct SharedLink {
-    pub name: Arc<str>,
     pub counters: LinkCounters,
     calls: mpsc::UnboundedSender<Call>,
     queue: Arc<QueueShare>,
@@ -133,7 +131,6 @@ pub struct Route {
 impl SharedLink {
     pub(crate) fn new(settings: &LinkSettings, calls: mpsc::UnboundedSender<Call>) -> SharedLink {
         SharedLink {
-            name: settings.name.as_str().into(),
             counters: LinkCounters::default(),
             calls,
             queue: QueueShare::new(settings.queue),

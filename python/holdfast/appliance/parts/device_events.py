@@ -32,9 +32,20 @@ class DeviceEvents:
         self._down: set[str] = set()
         self._full: dict[str, int] = {}
 
-    def replace(self, gone: Iterable[str], polled: Collection[str], links: Collection[str]) -> None:
-        """Forgets devices that are gone or polled with other settings, and all but these links."""
+    def replace(
+        self,
+        gone: Iterable[str],
+        polled: Collection[str],
+        links: Collection[str],
+        refused: Mapping[str, int],
+    ) -> None:
+        """Forgets devices that are gone or polled with other settings, and all but these links.
+
+        `refused` is how often the queue of each link was full until now: links may have exchanged
+        their names.
+        """
         self._down &= set(links)
+        self._full = dict(refused)
         names = {*gone, *polled}
         for known in (self.health, self._plan_errors):
             for name in names & known.keys():

@@ -104,6 +104,8 @@ class Devices(Part):
             for name in self.passages.keys() - plan.links.passages.keys():
                 del self.passages[name]
             plan.links.limit_waits(self._links)
+            # With the names until now.
+            self._log_links()
             self._links = plan.links.links
             gone = self._polled - polled
             if poller is not None:
@@ -118,7 +120,8 @@ class Devices(Part):
                 values.have_begun(replaced)
             self._polled = polled
             changed = {key.partition(".")[2] for key in plan.changed}
-            self._events.replace(gone, made, self._links.keys() - changed)
+            refused = {link: on.counters()["refused_full"] for link, on in self._links.items()}
+            self._events.replace(gone, made, self._links.keys() - changed, refused)
 
         return adopt
 
@@ -143,6 +146,9 @@ class Devices(Part):
         """Logs changes of devices and links."""
         for name, counted in self._counters().items():
             self._events.log_device(name, counted, self.config.devices[name].forward)
+        self._log_links()
+
+    def _log_links(self) -> None:
         for name, link in self._links.items():
             counted = link.counters()
             self._events.log_link(name, counted, link.error)

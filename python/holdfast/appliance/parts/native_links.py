@@ -32,20 +32,25 @@ class Links:
     """By the name of the link or device."""
     passages: dict[str, _core.Passage] = field(default_factory=dict)
     """By the name of the memory."""
-    waits: dict[str, float] = field(default_factory=dict)
-    """How many seconds clients of the routes of a link wait for a reply, at most; by its name."""
+    waits: dict[_core.Link, float] = field(default_factory=dict)
+    """How many seconds clients of the routes of a link wait for a reply, at most."""
 
     def add_route(self, name: str, link: _core.Link, timeout: float, unit: int | None) -> None:
-        """Adds the route of a link or device."""
+        """Adds the route of a link or device. The first one names the link.
+
+        A link that is in use already may have had another name before a reload.
+        """
         self.routes[name] = link.route(name, unit=unit, timeout=timeout)
-        self.waits[link.name] = max(timeout, self.waits.get(link.name, 0.0))
+        if link not in self.waits:
+            self.links[name] = link
+        self.waits[link] = max(timeout, self.waits.get(link, 0.0))
 
     def limit_waits(self, before: Mapping[str, _core.Link]) -> None:
         """Limits the calls of the gateway on all links, instead of those `before`."""
         for link in before.values():
             link.set_longest_wait(None)
-        for name, link in self.links.items():
-            link.set_longest_wait(self.waits.get(name))
+        for link, wait in self.waits.items():
+            link.set_longest_wait(wait)
 
 
 def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) -> Links:
@@ -57,7 +62,6 @@ def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) 
     made = Links()
     for name, settings in config.links.items():
         link = poller.link(
-            name,
             endpoint_at(f"links.{name}.url", settings.target),
             in_flight=None if settings.in_flight == "auto" else settings.in_flight,
             queue=settings.queue,
@@ -66,19 +70,16 @@ def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) 
             preferred=list(settings.priority),
             retry=settings.retry.pauses,
         )
-        made.links[name] = link
         made.add_route(name, link, settings.timeout, None)
     for name in routed(config):
         if name not in config.devices:
             continue
         device = config.devices[name]
         link = poller.link(
-            name,
             endpoint_at(f"devices.{name}.url", device.target),
             in_flight=None if device.in_flight == "auto" else device.in_flight,
             retry=device.retry.pauses,
         )
-        made.links.setdefault(link.name, link)
         made.add_route(name, link, device.timeout, device.unit)
     passed: dict[str, list[tuple[Area, int, int, str, int, bool]]] = {}
     for name, device in config.devices.items():
