@@ -399,16 +399,18 @@ def test_a_node_whose_log_hangs_lets_others_poll_and_takes_part_again(
 def test_without_its_log_a_node_stops_polling_and_comes_back(
     node: Callable[..., Appliance], server: NatsServer, device: Device
 ) -> None:
-    one = node("a", BRIEF)
-    wire.until(lambda: health(one) == "ok", "it polls")
+    one = node("a", BRIEF, tags={"level": {"area": "holding_registers", "address": 7}})
+    wire.until(one.diagnostics.tag_values, "it polls")
     server.kill()
     wire.until(lambda: health(one) == "standby", "it stands by")
+    wire.until(lambda: not one.diagnostics.tag_values(), "another node would have the values")
     wire.until(lambda: device.sources() and not device._peers, "the device has no connection")
     polls = len(device.peers)
     wire.until(lambda: not one.replicas()["site"]["connected"], "the log is gone")
     assert len(device.peers) == polls
     server.start()
     wire.until(lambda: health(one) == "ok", "it polls again")
+    wire.until(one.diagnostics.tag_values, "it has values again")
 
 
 def test_a_log_whose_servers_have_lost_it_is_said_to_have_failed(

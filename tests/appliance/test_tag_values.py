@@ -6,6 +6,7 @@ import json
 import queue
 import time
 import urllib.request
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -300,6 +301,45 @@ def test_a_poll_of_a_device_that_was_replaced_is_not_of_the_new_one(tmp_path: Pa
     finally:
         polls.waiting.put(None)
         found.join(wire.DEADLINE)
+
+
+def test_a_device_that_another_node_polls_has_no_values(tmp_path: Path) -> None:
+    made = settings(502)
+    made["outputs"]["out"]["publish"] = "change"
+    config = load(saved(tmp_path, made))
+    polls: Any = Polls()
+    found = TagValues(polls, time.monotonic())
+    found.adopt(config)
+    buffer = found._outputs["out"].buffer
+    registers = [("holding_registers", 0, 6, bytes(12), 0, 0.0), ("coils", 0, 1, b"\0", 0, 0.0)]
+
+    def poll(blocks: list[Any]) -> int:
+        """How many readings the output got."""
+        before = len(buffer)
+        found._handle(deque([("m", 0.0, blocks)]))
+        return len(buffer) - before
+
+    assert poll([]) == 0
+    assert (set(found.standby), found.answering()) == ({"m"}, {"m": False})
+    assert (poll(registers), poll(registers)) == (4, 0)
+    assert (found.answering(), len(found.latest())) == ({"m": True}, 4)
+    assert not found.standby
+    answers = found.answers
+    assert poll([]) == 0
+    assert (set(found.standby), found.answering()) == ({"m"}, {"m": False})
+    assert found.latest() == []
+    assert found.answers == answers + 1
+    waiting = len(buffer)
+    found.refresh("out")
+    assert len(buffer) == waiting
+    found.adopt(config)
+    assert found.standby == {"m"}
+    # Another node may have published another value meanwhile.
+    assert poll(registers) == 4
+    assert not found.standby
+    poll([])
+    found.adopt(load(saved(tmp_path, settings(502, devices={}))))
+    assert not found.standby
 
 
 def test_a_backlog_is_handled_in_turns_and_losses_are_counted(

@@ -17,7 +17,9 @@ from holdfast.appliance.parts.tag_writes import TagWrites
 from holdfast.appliance.services.outputs import _Site
 from holdfast.events.audit.refusal_summaries import WHOLE_WRITES
 from holdfast.outputs import sending
+from holdfast.outputs.device_access import NotWritten
 from holdfast.outputs.mqtt import commands
+from holdfast.polling.faults import STANDBY, fault_word
 from holdfast.runtime.standstill import STANDSTILL_S
 from support import wire
 from support.audits import await_writes, full, lines, writes
@@ -296,6 +298,33 @@ def test_a_write_without_an_answer_at_the_stop_is_reported(
     plant.stop()
     assert reply(held.probe, "temperature")["reason"] == "unanswered"
     assert held.outcomes() == ["unanswered"]
+
+
+@pytest.mark.parametrize("is_known", [True, False], ids=["known", "just lost"])
+def test_a_command_for_a_device_that_another_node_polls_has_no_reply(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch, is_known: bool
+) -> None:
+    write = _Site.write
+
+    def refuse(site: _Site, device: str, *more: Any) -> None:
+        if device == "pump":
+            raise NotWritten(fault_word(STANDBY), "another node uses the device")
+        write(site, device, *more)
+
+    if is_known:
+        monkeypatch.setattr(_Site, "standby", frozenset({"pump"}))
+    else:
+        monkeypatch.setattr(_Site, "write", refuse)
+    for name in ("pump", "fan"):
+        plant.device(name)
+    probe = plant.probe("plant/+/+/set/reply", "plant/holdfast/status/fan")
+    plant.run(writes=True)
+    probe.until("plant/holdfast/status/fan", "online")
+    probe.publish("plant/pump/temperature/set", "99")
+    probe.publish("plant/fan/valve/set", "true")
+    assert probe.get().topic == "plant/fan/valve/set/reply"
+    counts = {"written": 1, "refused": 0, "ignored": 0, "replies_dropped": 0}
+    assert plant.status()["commands"] == counts
 
 
 def test_a_reload_brings_new_set_topics(plant: Plant) -> None:

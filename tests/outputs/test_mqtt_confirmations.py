@@ -83,6 +83,7 @@ class Site:
 
     def __init__(self) -> None:
         self.refreshed = 0
+        self.standby: frozenset[str] = frozenset()
         self.retained: dict[tuple[str, str], str] = {}
 
     def tags(self) -> dict[str, Any]:
@@ -149,6 +150,22 @@ def made(broker: Broker | FakeBroker, site: Site, stop: Stop, **more: Any) -> Mq
     output = MqttOutput("home", settings, site)
     output.until(stop)
     return output
+
+
+def test_what_waits_is_not_published_while_another_node_polls_the_device(stop: Stop) -> None:
+    broker, site = Broker(2, 100), Site()
+    output = made(broker, site, stop)
+    readings = [*numbered(3), reading(7, device="fan")]
+    with pytest.raises(OSError, match="connection"):
+        output.send(readings)
+    site.standby = frozenset({"pump"})
+    output.send(readings)
+    output.send(numbered(1, 3))
+    site.standby = frozenset()
+    output.send(numbered(1, 4))
+    output.close()
+    broker.thread.join()
+    assert broker.seen == [[0, 1], [7, 4]]
 
 
 def test_a_step_goes_on_where_it_was(stop: Stop) -> None:

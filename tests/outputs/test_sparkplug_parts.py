@@ -471,6 +471,7 @@ class Pump:
 
     revision = answers = 0
     retained: ClassVar[dict[tuple[str, str], str]] = {}
+    standby: frozenset[str] = frozenset()
 
     def tags(self) -> dict[str, Any]:
         return {"pump": [SPEED]}

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 from holdfast.events import log_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence, Set
 
     from holdfast.polling import Reading
     from holdfast.tags import Tag
@@ -57,6 +57,10 @@ class Site(Protocol):
 
     def answering(self) -> Mapping[str, bool]:
         """Whether each device answers, as far as it is known."""
+
+    @property
+    def standby(self) -> Set[str]:
+        """The devices that another node polls, which has newer values of them."""
 
     def latest(self) -> Sequence[Reading]:
         """The last reading of each tag."""

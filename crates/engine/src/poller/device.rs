@@ -351,6 +351,8 @@ impl Device {
             self.link.release();
             self.state.set_standby(true);
             self.forwards.iter().for_each(|forward| forward.withdraw());
+            // Behind the last poll, so that its receiver forgets what that has read.
+            self.hand_over(Instant::now(), Gathered::default());
             self.publish_status();
             loop {
                 tokio::select! {

@@ -24,7 +24,8 @@ pub struct Poll {
     /// The scheduled time, counted from the start of the poller. A poll outside the schedule has
     /// the time when it began.
     pub due: Duration,
-    /// In the order of their requests. Blocks after one without an answer are missing.
+    /// In the order of their requests. Blocks after one without an answer are missing. There are none
+    /// when the device begins to stand by.
     pub blocks: Vec<BlockResult>,
 }
 

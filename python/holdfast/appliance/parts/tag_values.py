@@ -54,7 +54,7 @@ _LATE_S = 1.0
 """Age of a poll from which on the thread rests between turns as long as they take."""
 
 Poll: TypeAlias = "tuple[str, float, list[PolledBlock]]"
-"""The device, the scheduled time in seconds, and the blocks."""
+"""The device, the scheduled time in seconds, and the blocks: none if another node polls it now."""
 
 
 def _is_late(poll: Poll) -> bool:
@@ -84,13 +84,14 @@ class _Output:
     def offer(self, polls: Iterable[tuple[str, Sequence[Reading]]]) -> None:
         """Offers what is published of the polls of devices."""
         only = self.settings.devices
-        self.buffer.offer(
-            [
-                self.changes.of(readings)
-                for device, readings in polls
-                if only is None or device in only
-            ]
-        )
+        offered = []
+        for device, readings in polls:
+            if only is not None and device not in only:
+                continue
+            if not readings:  # Another node publishes until this one has the lease again.
+                self.changes.forget([device])
+            offered.append(self.changes.of(readings))
+        self.buffer.offer(offered)
 
 
 class TagValues:
@@ -111,6 +112,8 @@ class TagValues:
         self._outputs: dict[str, _Output] = {}
         self._latest: dict[str, list[Reading]] = {}
         self._answering: dict[str, bool] = {}
+        self.standby: frozenset[str] = frozenset()
+        """The devices with tags that another node polls. Replaced as a whole."""
         self.revision = 0
         """Changes with the tags of any device, and with `devices`."""
         self.devices: dict[str, DeviceInfo] = {}
@@ -161,6 +164,7 @@ class TagValues:
             self._answering = {
                 name: answers for name, answers in self._answering.items() if name in readers
             }
+            self.standby &= readers.keys()
             # A reader keeps its decoders while the tags of its device stay.
             unchanged = {name: self._readers[name] for name in readers if name not in changed}
             self._readers = readers | unchanged
@@ -281,6 +285,8 @@ class TagValues:
     def _offer(self, polls: Sequence[DevicePoll]) -> None:
         for poll in polls:
             self._latest[poll.device] = poll.readings
+            if (not poll.readings) is not (poll.device in self.standby):
+                self.standby ^= {poll.device}
             answers = poll.has_answered
             if self._answering.get(poll.device) is not answers:
                 self._answering[poll.device] = answers

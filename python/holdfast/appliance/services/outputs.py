@@ -75,6 +75,10 @@ class _Site:
         answers = self._values.answering()
         return {name: answer for name, answer in answers.items() if self._has(name)}
 
+    @property
+    def standby(self) -> frozenset[str]:
+        return self._values.standby
+
     def latest(self) -> list[Reading]:
         return [reading for reading in self._values.latest() if self._has(reading.device)]
 

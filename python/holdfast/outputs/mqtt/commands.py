@@ -13,6 +13,7 @@ from paho.mqtt.properties import Properties
 from holdfast.config.values.mqtt_output_topics import REPLY
 from holdfast.outputs.device_access import CommandOutcomes, NotWritten
 from holdfast.outputs.mqtt.delivery import NO_PROPERTIES, Message, packed_topic
+from holdfast.polling.faults import STANDBY, fault_word
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -66,13 +67,16 @@ class Commands(CommandOutcomes):
         return list(self._tags)
 
     def take(self, message: Publish, session: Session, *, is_retained: bool) -> bool:
-        """Carries out a message, if its topic is one of a writable tag."""
+        """Carries out a message, if its topic is one of a writable tag.
+
+        A command for a device that another node polls is left to that node, without a reply.
+        """
         found = self._tags.get(message.topic)
         if found is None:
             return False
         if is_retained:
             self.ignore(message.topic, "retained")
-        elif message.payload:
+        elif message.payload and found[0] not in self._site.standby:
             self._write(message, session, *found)
         return True
 
@@ -106,6 +110,12 @@ class Commands(CommandOutcomes):
         refused: NotWritten | None,
     ) -> None:
         """Notes an outcome, and replies. Called by any thread."""
+        if refused is not None and refused.reason == fault_word(STANDBY):
+            # The lease has just gone to another node, which replies.
+            with self._changed:
+                self._waiting -= 1
+                self._changed.notify_all()
+            return
         self.ended(device, tag, refused)
         reply = {"status": "accepted", "device": device, "tag": tag}
         if refused is not None:

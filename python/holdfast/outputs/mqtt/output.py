@@ -17,7 +17,7 @@ from holdfast.outputs.mqtt.receiver import BrokerReceiver
 from holdfast.outputs.mqtt.session import Session
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping, Sequence, Set
 
     from holdfast.config.models.outputs import MqttOutputConfig
     from holdfast.net.mqtt.packets import Publish
@@ -42,6 +42,8 @@ class MqttOutput(BrokerReceiver):
         self._payloads = Payloads(settings)
         self._taken: list[Reading] = []
         self._messages: Sequence[Message] = ()
+        self._standby: Set[str] = frozenset()
+        """The devices whose readings are left out of the messages."""
         self._commands = Commands(name, self._broker, self._topics, site)
         self._tags: dict[str, set[str]] = {}
         self._removal: Delivery | None = None
@@ -67,9 +69,13 @@ class MqttOutput(BrokerReceiver):
         """
         session = self._connected()
         self._keep_up(session)
-        if readings is not self._taken:
+        standby = self._site.standby
+        if readings is not self._taken or standby != self._standby:
             self._payloads.settle(sent=False)
-            self._taken, self._messages = readings, self._payloads.messages(readings)
+            # What waited here is older than what the node that polls the device has published.
+            own = [each for each in readings if each.device not in standby]
+            self._taken, self._messages = readings, self._payloads.messages(own)
+            self._standby = standby
         delivery = session.publish(self._messages)
         try:
             self._wait(session, delivery)
