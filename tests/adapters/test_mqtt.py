@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
-from holdfast.adapters.mqtt import inbox
+from holdfast.adapters.mqtt import inbox, sessions
 from holdfast.ingest import MemoryAccess
 from support import wire
 from support.brokers import free_port
@@ -156,6 +156,33 @@ def test_a_retained_message_is_not_delivered_again_to_an_adapter_that_replaces_a
     after.wait_until_received(3)
 
     assert rig.registers(0, 3) == [43, 52, 44]
+
+
+def test_a_retained_message_is_not_delivered_again_to_a_memory_that_was_restored(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broker = rig.broker()
+    broker.publish("plant/ingest", text(command([42])), "-r", "-q", "1")
+    broker.publish("plant/other", text(command([52], memory="other")), "-r", "-q", "1")
+    both = [subscription(), subscription("plant/other", memories=["plant", "other"])]
+    running = rig.run(settings(broker.url, *both), restored={"plant"})
+    running.wait_until_received(2)
+    wire.until(lambda: broker.log.count("Received PUBACK from holdfast-test") == 2, "acknowledged")
+    rig.memory.write("holding_registers", 0, [43])
+    rig.other.write("holding_registers", 0, [53])
+    running.stop()
+
+    # Another process knows nothing of the session, which the topic `new` is not in.
+    monkeypatch.setattr(sessions, "_SESSIONS", {})
+    broker.publish("plant/new", text(command([62], 1)), "-r", "-q", "1")
+    after = rig.run(settings(broker.url, *both, subscription("plant/new")), restored={"plant"})
+    after.wait_until_received(4)
+    after.wait_until_connected()
+    rig.probe(broker).publish("plant/ingest", text(command([44], 2)))
+    after.wait_until_received(5)
+
+    assert rig.registers(0, 3) == [43, 62, 44]
+    assert rig.other.read("holding_registers", 0, 1) == [52]
 
 
 @pytest.mark.parametrize("version", VERSIONS)

@@ -542,6 +542,40 @@ def test_with_tokens_names_of_rest_have_no_effect(folder: Folder) -> None:
     ]
 
 
+SHARED = """\
+memories: {plant: {holding_registers: 10, replicate: {log: site}}, own: {holding_registers: 10}}
+logs: {site: {node: a, SERVERS}}
+mqtt:
+  url: mqtt://broker
+  client_id: plant
+  subscriptions:
+    - {topic: in, qos: QOS, memories: [own, plant], areas: [holding_registers]}
+    - {topic: own, qos: 1, memories: [own], areas: [holding_registers]}
+  map:
+    - {topic: level, qos: QOS, memory: plant, tag: {area: holding_registers, address: 0}}
+"""
+KEPT = (
+    "mqtt.{}[0].qos: found 1: messages that the broker keeps while this node is away are written "
+    "to plant afterwards, over newer values of other nodes; with qos 0, it keeps none"
+)
+
+
+@pytest.mark.parametrize(
+    ("servers", "qos", "told"),
+    [
+        ("servers: [nats://10.0.0.1:4222]", "1", ["subscriptions", "map"]),
+        ("servers: [nats://10.0.0.1:4222]", "0", []),
+        ("embedded: site", "1", []),
+    ],
+    ids=["kept", "not kept", "one machine"],
+)
+def test_messages_that_a_broker_keeps_for_one_of_several_nodes_are_a_warning(
+    folder: Folder, servers: str, qos: str, told: list[str]
+) -> None:
+    found = folder.warnings(SHARED.replace("SERVERS", servers).replace("QOS", qos))
+    assert [each.partition(": ")[2] for each in found] == [KEPT.format(each) for each in told]
+
+
 PASSED = """\
 memories: {plant: {coils: 8, holding_registers: 100, input_registers: 10}}
 devices:

@@ -27,7 +27,7 @@ from support.running import content
 from support.tcp_proxy import Proxy
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Set
     from pathlib import Path
     from types import TracebackType
     from typing import Self
@@ -145,9 +145,10 @@ class Running:
         memory_access: MemoryAccess,
         mapped: Mapping[str, MappedTag] | None = None,
         first_pause: float = PAUSE_S,
+        restored: Set[str] = frozenset(),
     ) -> None:
         pauses = {"first_pause": first_pause, "max_pause": max(first_pause, PAUSE_S)}
-        self.adapter = Mqtt(config, memory_access, mapped, **pauses)
+        self.adapter = Mqtt(config, memory_access, mapped, restored, **pauses)
         self.memory_access = memory_access
         self._stop = Stop()
         self._failure: BaseException | None = None
@@ -232,9 +233,11 @@ class Rig:
         memory_access: MemoryAccess | None = None,
         mapped: Mapping[str, MappedTag] | None = None,
         first_pause: float = PAUSE_S,
+        restored: Set[str] = frozenset(),
     ) -> Running:
         """Starts an adapter without waiting for its connection."""
-        running = Running(config, memory_access or self.memory_access, mapped, first_pause)
+        access = memory_access or self.memory_access
+        running = Running(config, access, mapped, first_pause, restored)
         self._running.callback(running.stop)
         return running
 

@@ -210,7 +210,7 @@ class _Running:
             memories, self.liveness, self._parts, adapters, self.devices.readings
         )
         context = ServiceContext(
-            memories, audit, self.devices, self.diagnostics, self.health, appliance, adapters
+            memories, audit, self.devices, self.diagnostics, self.health, appliance, logs, adapters
         )
         self.metrics = LastServices(config, context, MetricsService())
         self.services = Services(

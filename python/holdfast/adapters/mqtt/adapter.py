@@ -21,7 +21,7 @@ from holdfast.net.secure_channel import failure_text
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Set
 
     from paho.mqtt.client import Client, DisconnectFlags
     from paho.mqtt.properties import Properties
@@ -54,11 +54,14 @@ class Mqtt:
         settings: MqttConfig,
         memory_access: MemoryAccess,
         mapped: Mapping[str, MappedTag] | None = None,
+        restored: Set[str] = frozenset(),
         *,
         first_pause: float = FIRST_PAUSE_S,
         max_pause: float = MAX_PAUSE_S,
     ) -> None:
-        """`mapped` are the tags of topics with plain values. For the pauses, see `Backoff`."""
+        """`mapped` are the tags of topics with plain values, `restored` the memories that had their
+        contents before the process began. For the pauses, see `Backoff`.
+        """
         self._settings = settings
         self._pauses = first_pause, max_pause
         self._broker = joined(settings.host, settings.port)
@@ -67,7 +70,7 @@ class Mqtt:
         self._inbox = Inbox(memory_access, filters, values, self._broker)
         self._answers = Answers(filters, values)
         session = session_of(self._broker, settings.client_id)
-        self._subscriptions = Subscriptions(settings, mapped or {}, session.known)
+        self._subscriptions = Subscriptions(settings, mapped or {}, session.known, restored)
         self._unreleased = session.unreleased
         self._failures = _Failures(self._broker)
         self._connected_at: float | None = None

@@ -7,15 +7,17 @@ from typing import TYPE_CHECKING
 
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from holdfast.config.models.services import SubscriptionConfig
+
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Set
 
     from paho.mqtt.reasoncodes import ReasonCode
 
     from holdfast.adapters.mqtt.connection import BrokerConnection
     from holdfast.adapters.mqtt.sessions import Known, Meaning
     from holdfast.config.models.root import MappedTag
-    from holdfast.config.models.services import MappingConfig, MqttConfig, SubscriptionConfig
+    from holdfast.config.models.services import MappingConfig, MqttConfig
 
 
 @dataclass
@@ -30,9 +32,18 @@ class _Topic:
 class Subscriptions:
     """The topics of one adapter, over all its connections."""
 
-    def __init__(self, settings: MqttConfig, mapped: Mapping[str, MappedTag], known: Known) -> None:
-        """`known` is what the process knows of the session, also from adapters before this one."""
-        self._mapped, self._known = mapped, known
+    def __init__(
+        self,
+        settings: MqttConfig,
+        mapped: Mapping[str, MappedTag],
+        known: Known,
+        restored: Set[str],
+    ) -> None:
+        """`known` is what the process knows of the session, also from adapters before this one.
+
+        `restored` are the memories that had their contents before the process began.
+        """
+        self._mapped, self._known, self._restored = mapped, known, restored
         self._is_version_5 = settings.version == "5"
         self._topics = [_Topic(entry) for entry in settings.subscriptions]
         self._topics += [_Topic(entry) for entry in settings.map]
@@ -58,17 +69,20 @@ class Subscriptions:
         """Subscribes, so that no retained message comes twice in a session.
 
         With MQTT 5, an option of SUBSCRIBE prevents that. With MQTT 3.1.1, topics are skipped that
-        this process has already subscribed to in this session.
+        this process has already subscribed to in this session. A process begins with empty memories
+        and needs retained messages, except for memories that are restored: others may have written
+        newer values since.
         """
         entry = topic.entry
         before, granted = self._known.get(entry.topic, (None, None))
         # One that was changed is new: its values go elsewhere.
         known = granted if before == self._meaning(entry) else None
         if self._is_version_5:
+            has_had = known is not None or (before is None and self._is_restored(entry))
             retained = (
-                SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
-                if known is None
-                else SubscribeOptions.RETAIN_SEND_IF_NEW_SUB
+                SubscribeOptions.RETAIN_SEND_IF_NEW_SUB
+                if has_had
+                else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
             )
             options = SubscribeOptions(qos=entry.qos, retainHandling=retained)
             identifier = link.subscribe(entry.topic, options=options)[1]
@@ -91,6 +105,11 @@ class Subscriptions:
         if topic.granted is not None:
             self._known[topic.entry.topic] = (self._meaning(topic.entry), topic.granted)
         return topic.entry.topic if reason.is_failure else None
+
+    def _is_restored(self, entry: SubscriptionConfig | MappingConfig) -> bool:
+        """Whether all memories of a topic are restored: others have only what messages write."""
+        memories = entry.memories if isinstance(entry, SubscriptionConfig) else [entry.memory]
+        return self._restored >= set(memories)
 
     def _meaning(self, entry: SubscriptionConfig | MappingConfig) -> Meaning:
         return entry, self._mapped.get(entry.topic)

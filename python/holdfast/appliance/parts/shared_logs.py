@@ -60,6 +60,8 @@ class SharedLogs(Part):
         self._memories = memories
         self._logs: dict[str, _core.Log] = {}
         self._servers: dict[str, NatsServer] = {}
+        self.restored: set[str] = set()
+        """The memories whose contents come from a log. Not those of a log that began here."""
 
     def open(self, plan: Plan) -> None:
         """Returns when the memories have caught up.
@@ -124,13 +126,16 @@ class SharedLogs(Part):
             raise LogNotJoined(f"logs.{name}: {error}", is_permanent=is_permanent) from None
         except ValueError as error:
             raise LogNotJoined(f"logs.{name}: {error}", is_permanent=True) from None
+        sequence, names = log.status()["sequence"], [each for each, _ in members]
+        if sequence > 1:  # The first message is that this node has joined.
+            self.restored.update(names)
         log_lines.write(
             logging.INFO,
             "log_joined",
             log=name,
             node=settings.node,
-            sequence=log.status()["sequence"],
-            memories=",".join(each for each, _ in members),
+            sequence=sequence,
+            memories=",".join(names),
         )
         self._memories.follow(name, log)
         log_servers.begin(name, settings)

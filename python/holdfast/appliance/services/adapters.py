@@ -51,7 +51,7 @@ class MqttService(Service):
         from holdfast.adapters.mqtt import Mqtt
 
         access, mapped = running.memory_access("mqtt"), config.mapped()
-        factory = partial(Mqtt, settings, access, mapped)
+        factory = partial(Mqtt, settings, access, mapped, running.context.logs.restored)
         yield Supervisor("mqtt", factory, settings, list(mapped.items()), access=access)
 
 

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from holdfast.appliance.parts.audit import AuditLog
     from holdfast.appliance.parts.devices import Devices
     from holdfast.appliance.parts.part import Plan
+    from holdfast.appliance.parts.shared_logs import SharedLogs
     from holdfast.appliance.services.supervision import Supervisor
     from holdfast.config import Config
     from holdfast.config.models.server_tls import HttpsConfig
@@ -40,6 +41,7 @@ class ServiceContext:
     diagnostics: DiagnosticsSource
     health: HealthSource
     sessions: SessionControl
+    logs: SharedLogs
     adapters: dict[str, Supervisor]
     """Those of all parts, by name."""
 

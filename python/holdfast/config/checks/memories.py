@@ -241,6 +241,7 @@ def warn_of_grants(scope: Scope) -> None:
                 report.warn((*grant.path, "areas", index), message)
         _warn_of_while_sealed(config, grant, report)
     _warn_of_passed(config, report)
+    _warn_of_late_messages(config, report)
     if config.rest is not None and config.rest.tokens == "none":
         return  # Every REST client may write everything, including the gate bits.
     for name, memory in config.memories.items():
@@ -265,6 +266,33 @@ def _warn_of_while_sealed(config: Config, grant: WriterGrant, report: Report) ->
         if not any(area in memory.areas() for memory in sealed):
             message = f"{area} has no effect: none of its memories with a seal has this area"
             report.warn((*grant.path, "while_sealed", index), message)
+
+
+def _warn_of_late_messages(config: Config, report: Report) -> None:
+    """Warns about messages that a broker keeps for a node, while other nodes write the memory."""
+    if config.mqtt is None:
+        return
+    shared = {
+        name
+        for name, memory in config.memories.items()
+        if memory.replicate is not None and config.logs[memory.replicate.log].embedded is None
+    }
+    topics: list[tuple[KeyPath, int, Sequence[str]]] = [
+        (("mqtt", "subscriptions", index), topic.qos, topic.memories)
+        for index, topic in enumerate(config.mqtt.subscriptions)
+    ]
+    topics += [
+        (("mqtt", "map", index), topic.qos, (topic.memory,))
+        for index, topic in enumerate(config.mqtt.map)
+    ]
+    for path, qos, memories in topics:
+        if qos and (names := [name for name in memories if name in shared]):
+            message = (
+                f"found {qos}: messages that the broker keeps while this node is away are written "
+                f"to {listing(names)} afterwards, over newer values of other nodes; with qos 0, it "
+                "keeps none"
+            )
+            report.warn((*path, "qos"), message)
 
 
 def _warn_of_passed(config: Config, report: Report) -> None:
