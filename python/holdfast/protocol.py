@@ -57,9 +57,6 @@ CODES = tuple(OF_CODE)
 MAX_CODE = 0x7F
 """The largest function code; greater ones are exceptions (V1.1b3, 4.1)."""
 
-TURNAROUND_S = _core.TURNAROUND_S
-"""The time for devices to carry out a broadcast (Modbus over Serial Line V1.02, 2.4.1)."""
-
 READ_RECORDS = _core.READ_RECORDS
 """Maximum number of file records that one request reads."""
 

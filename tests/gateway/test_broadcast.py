@@ -1,4 +1,4 @@
-"""Broadcasts through the gateway: writes to unit id 0 with RTU over TCP, which nobody answers."""
+"""Broadcasts through the gateway: writes to unit id 0 of a serial line, which nobody answers."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from support import gateways, lines, wire
-from support.fake_device import HANG_UP, FakeDevice, Stream
+from support.fake_device import HANG_UP, FakeDevice, Stream, Udp, silent
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from support import web
     from support.fake_device import Asked
@@ -80,6 +80,27 @@ def test_a_broadcast_is_sent_and_not_waited_for(
     assert [each["outcome"] for each in log.of("gateway_write")] == ["sent"]
 
 
+@pytest.mark.parametrize(
+    ("device", "frame"),
+    [
+        (lambda: Stream("rtu+tcp", then=silent), bytes.fromhex("00 06 0001 0007 9819")),
+        (lambda: Stream("ascii+tcp", then=silent), b":000600010007F2\r\n"),
+        (lambda: Udp(kind="rtu+udp", then=silent), bytes.fromhex("00 06 0001 0007 9819")),
+    ],
+    ids=["rtu+tcp", "ascii+tcp", "rtu+udp"],
+)
+def test_a_broadcast_has_the_form_of_its_transport(
+    gateway: Running, device: Callable[[], Stream | Udp], frame: bytes
+) -> None:
+    with device() as line:
+        kind, _, port = line.url.replace("://127.0.0.1", "").partition(":")
+        where = {"host": "127.0.0.1", "port": int(port), "transport": kind, "unitId": 0}
+        answer = gateway.ask("/write/register", {**where, "address": 1, "value": 7})
+        assert answer.json["success"] is True
+        line.await_requests(1)
+        assert line.requests[0].raw == frame
+
+
 def test_another_unit_of_the_line_is_asked_afterwards(gateway: Running, line: Line) -> None:
     """On one connection at a time."""
     pdu = bytes.fromhex("06 0003 0007")
@@ -107,7 +128,7 @@ def test_a_line_that_is_not_there_is_told(gateway: Running, line: Line) -> None:
     ("reply", "reason", "says"),
     [
         (HANG_UP, "connection_lost", "closed by the peer"),
-        (lines.rtu(b"\x85\x02", unit=0), "invalid_reply", "00 85 02"),
+        (lines.rtu(b"\x85\x02", unit=0), "invalid_reply", "exception 02"),
     ],
 )
 def test_a_line_that_refuses_is_told(

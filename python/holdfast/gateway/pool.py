@@ -200,7 +200,7 @@ class Pool:
             result = None
             if is_broadcast(key.transport, unit):
                 await device.transport.close()  # The peer may accept only one connection.
-                await send(key, request)
+                await send(self._dial(key, 1), request, timeout)
             else:
                 result = await device.transport.call(request, unit, device.timeout)
             device.doubtful = False
