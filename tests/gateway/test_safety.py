@@ -586,9 +586,35 @@ def test_a_request_under_way_is_answered_when_the_gateway_ends(path: str, ending
         running.stop.set()
         answer = waiting.result(wire.DEADLINE)
     assert (answer.status, answer.headers["holdfast-reason"]) == (503, "stopping")
-    assert "may have been carried out" in answer.json["error"]
-    maybe = answer.headers.get("holdfast-maybe-written")
-    assert maybe == (None if path == "/read" else "true")
+    fate, maybe = {
+        "/read": ("", None),
+        "/write/register": ("; the write may have been carried out", "true"),
+    }[path]
+    assert answer.json["error"] == f"the gateway is stopping{fate}"
+    assert answer.headers.get("holdfast-maybe-written") == maybe
+
+
+def test_a_write_that_has_not_had_its_turn_when_the_gateway_ends_was_not_sent() -> None:
+    asked = threading.Semaphore(0)
+
+    def mute(_: bytes) -> None:
+        asked.release()
+
+    with (
+        FakeDevice(mute) as device,
+        gateways.running(limits={"ending": 0.05}) as running,
+        ThreadPoolExecutor(2) as threads,
+    ):
+        body = {**write(device), "timeout": LONG_MS}
+        threads.submit(running.ask, "/write/register", body)
+        assert asked.acquire(timeout=wire.DEADLINE)
+        waiting = threads.submit(running.ask, "/write/register", body)
+        wire.until(lambda: running.gateway.status()["requests"] == 2, "the second has come")
+        running.stop.set()
+        answer = waiting.result(wire.DEADLINE)
+        assert len(device.asked) == 1
+    assert answer.headers["holdfast-maybe-written"] == "false"
+    assert answer.json["error"] == "the gateway is stopping; the write was not sent"
 
 
 def test_a_request_that_can_still_be_done_when_the_gateway_ends_is_done() -> None:

@@ -64,7 +64,7 @@ EXCEPTION = b"holdfast-exception"
 FORM = b"application/x-www-form-urlencoded"
 """The default Content-Type of `curl -d`. The gateway treats it as JSON."""
 
-STOPPING = "the gateway is stopping; a pending write may have been carried out"
+STOPPING = "the gateway is stopping"
 HOSTS = "--host, or hosts in the configuration"
 WRITES_ON = "enable them with --access read-write, or with access: read-write in the configuration"
 
@@ -258,7 +258,11 @@ class App(Application):
                     # The client is there, and gets an answer.
                     stopping = BadRequest("stopping", STOPPING)
                     if is_write:
-                        stopping.headers = (outcome(device, stopping).header,)
+                        ended = outcome(device, stopping)
+                        stopping.detail += "; the write " + (
+                            "may have been carried out" if ended.maybe_written else "was not sent"
+                        )
+                        stopping.headers = (ended.header,)
                     raise stopping from None
 
     async def _reply(
