@@ -189,6 +189,19 @@ def test_what_is_no_value_is_told_by_its_place(client: web.Client, memory: holdf
     assert list(found["typedErrors"]) == ["1"]
 
 
+def test_a_number_that_json_can_not_have_says_so(
+    client: web.Client, memory: holdfast.Memory
+) -> None:
+    memory.write("holding_registers", 0, [0x7FC0, 0, 0xFF80, 0, 0x3FC0, 0])
+    found = done(client, "/read", functionCode=3, address=0, datatype="float32[3]")
+    assert found["typed"] == [None, None, 1.5]
+    assert found["typedText"] == ["nan", "-inf", "1.5"]
+    assert found["typedErrors"] == {
+        "0": "nan is not a JSON number",
+        "1": "-inf is not a JSON number",
+    }
+
+
 def test_an_exception_says_what_was_asked(client: web.Client) -> None:
     answer = ask(client, "/read", functionCode=3, address=9999, quantity=1)
     assert answer.status == 200

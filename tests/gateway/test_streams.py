@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import threading
+from math import nan
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlencode
 
@@ -84,6 +85,10 @@ def test_typed_values_change_as_a_whole(
     change = stream.next("change")
     assert change["typed"] == [{"index": 1, "value": 2.25, "text": "2.25"}]
     assert [each["address"] for each in change["changes"]] == [12]
+    memory.write("holding_registers", 12, written(nan))
+    error = "nan is not a JSON number"
+    change = stream.next("change")
+    assert change["typed"] == [{"index": 1, "value": None, "text": "nan", "error": error}]
 
 
 def test_bits_are_watched(

@@ -65,7 +65,9 @@ _STATUS = object_of(
         "connections": count("Open connections to devices"),
     }
 )
-_TYPED_CHANGE = object_of({"index": COUNT, "value": {}, "text": TEXT})
+_TYPED_CHANGE = object_of(
+    {"index": COUNT, "value": {}, "text": TEXT, "error": TEXT}, optional=("error",)
+)
 _WATCHES: dict[str, Schema] = {
     "Values": object_of({**_NOW, **RANGE_PROPERTIES}, optional=tuple(TYPED)),
     "Change": object_of(

@@ -134,7 +134,10 @@ def _read_exception(given: Given, _: RequestedDevice, error: ModbusException) ->
 
 
 TYPED: dict[str, Schema] = {
-    "typed": {"type": "array", "description": "With `datatype`: the values, `null` if invalid"},
+    "typed": {
+        "type": "array",
+        "description": "With `datatype`: the values, `null` where `typedErrors` has the reason",
+    },
     "typedText": {
         "type": "array",
         "items": {"type": "string"},
@@ -143,7 +146,7 @@ TYPED: dict[str, Schema] = {
     "typedErrors": {
         "type": "object",
         "additionalProperties": {"type": "string"},
-        "description": "By index in `typed`: why the value is invalid",
+        "description": "By index in `typed`: why the value is `null`",
     },
 }
 

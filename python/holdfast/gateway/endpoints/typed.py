@@ -39,15 +39,12 @@ class Typed:
     """The length of an array type; `None` for other types."""
 
     def decode(self, raw: Sequence[int]) -> dict[str, Any]:
-        """Returns the values and their texts; for an invalid value `null` and the error."""
+        """Returns the values and their texts; for what JSON can't have, `null` and the reason."""
         found = [self._value(raw[at : at + self.width]) for at in range(0, len(raw), self.width)]
-        wrong = {
-            str(index): str(each)
-            for index, each in enumerate(found)
-            if isinstance(each, ConversionError)
-        }
+        typed = [jsonable(each) for each in found]
+        wrong = {str(at): _flaw(found[at]) for at, each in enumerate(typed) if each is None}
         return {
-            "typed": [jsonable(each) for each in found],
+            "typed": typed,
             "typedText": [self._text(each) for each in found],
             **({"typedErrors": wrong} if wrong else {}),
         }
@@ -91,6 +88,11 @@ class Typed:
         if isinstance(value, float):
             return decimal_of(value, self.element)
         return value.hex(" ") if isinstance(value, bytes) else str(value)
+
+
+def _flaw(value: ConversionError | float) -> str:
+    """Why a value is `null` in JSON."""
+    return str(value) if isinstance(value, ConversionError) else f"{value} is not a JSON number"
 
 
 def typed(datatype: str | None, order: str, area: Area) -> Typed | None:

@@ -118,9 +118,10 @@ class _View:
         typed: list[dict[str, Any]] = []
         for index in sorted({at // kind.width for at in places}):
             value = kind.decode(found[index * kind.width : (index + 1) * kind.width])
-            typed.append(
-                {"index": index, "value": value["typed"][0], "text": value["typedText"][0]}
-            )
+            change = {"index": index, "value": value["typed"][0], "text": value["typedText"][0]}
+            if "typedErrors" in value:
+                change["error"] = value["typedErrors"]["0"]
+            typed.append(change)
         return {"typed": typed}
 
     def _now(self) -> dict[str, Any]:
