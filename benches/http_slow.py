@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 PLACES = """\
   max_connections: 16000
+  max_connections_per_source: null
   request_timeout: 3600
 """
 KINDS = {

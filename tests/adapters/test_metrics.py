@@ -17,6 +17,7 @@ from prometheus_client.parser import text_string_to_metric_families
 import holdfast
 from holdfast.adapters import Grant, MemoryAccess, Refused
 from holdfast.adapters.metrics import Metrics
+from holdfast.adapters.metrics.app import LIMITS
 from holdfast.appliance.parts.devices import Devices
 from holdfast.appliance.parts.mirrors import Mirrors
 from holdfast.appliance.services.supervision import Supervisor
@@ -25,6 +26,7 @@ from holdfast.config.models.services import MetricsConfig
 from holdfast.net.http.health import Check
 from holdfast.net.http.port import listen
 from support import web, wire
+from support.machine import needs_127_0_0_2
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -501,6 +503,12 @@ def test_probes_are_answered_by_status_and_each_check(client: web.Client, health
     assert (seen["holdfast_ready", "threads"], seen["holdfast_ready", "logs"]) == (1, 0)
     health.is_live = False
     assert client.get("/health/live").status == 503
+
+
+@needs_127_0_0_2
+@pytest.mark.parametrize("path", ["/metrics", "/health/live"])
+def test_one_source_can_not_take_all_places(address: tuple[str, int], path: str) -> None:
+    assert web.status_for_another(address, path, LIMITS.max_connections) == 200
 
 
 def test_a_slow_scrape_holds_up_no_probe(

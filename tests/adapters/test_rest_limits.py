@@ -761,6 +761,13 @@ def test_a_source_at_its_limit_is_refused(start: Start, connect: Connect) -> Non
     assert service.connections()["evicted"] == 0
 
 
+@needs_127_0_0_2
+def test_one_source_can_not_take_all_places(start: Start) -> None:
+    service = start()
+    places = service.settings.max_connections
+    assert web.status_for_another(service.address, "/api/v1/health", places) == 200
+
+
 def test_many_come_and_go(service: web.Service, connect: Connect) -> None:
     chance = random.Random(7)
     for _ in range(300):

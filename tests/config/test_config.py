@@ -289,8 +289,8 @@ def rest_of(loaded: Callable[..., Config], tokens: str) -> RestConfig:
 
 def test_rest_has_the_documented_defaults(loaded: Callable[..., Config]) -> None:
     rest = rest_of(loaded, "none")
-    assert (rest.max_body, rest.max_connections, rest.request_timeout) == (8388608, 64, 10)
-    assert (rest.max_connections_per_source, rest.when_full) == (None, "evict")
+    assert (rest.max_body, rest.max_connections, rest.request_timeout) == (8388608, 128, 10)
+    assert (rest.max_connections_per_source, rest.when_full) == (64, "evict")
     assert rest.tokens == "none"
 
 
@@ -661,6 +661,7 @@ def test_the_schema_takes_null_only_where_it_means_no_limit() -> None:
         if {"type": "null"} in node.get("anyOf", ())
     ]
     assert sorted(nullable) == [
+        "GatewayConfig.max_connections_per_source",
         "ModbusAsciiOverTcpListener.max_connections_per_source",
         "ModbusRtuOverTcpListener.max_connections_per_source",
         "ModbusTcpListener.max_connections_per_source",

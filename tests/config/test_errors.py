@@ -365,12 +365,19 @@ def test_a_limit_of_a_source_beyond_that_of_all_is_a_warning(folder: Folder) -> 
     ]
 
 
-def test_a_limit_of_a_source_beyond_that_of_rest_is_a_warning(folder: Folder) -> None:
-    rest = "rest: {bind: '127.0.0.1:80', sources: [127.0.0.1], tokens: none, "
-    text = f"{GOOD}{rest}max_connections_per_source: 65}}\n"
-    [warning] = folder.warnings(text)
+@pytest.mark.parametrize(
+    ("section", "more"),
+    [("rest", ""), ("gateway", "allow: [10.0.0.0/8], access: read-only, ")],
+    ids=["rest", "gateway"],
+)
+def test_a_limit_of_a_source_beyond_that_of_a_service_is_a_warning(
+    folder: Folder, section: str, more: str
+) -> None:
+    keys = f"{more}max_connections_per_source: 129"
+    text = f"{section}: {{bind: '127.0.0.1:80', sources: [127.0.0.1], tokens: none, {keys}}}\n"
+    [warning] = folder.warnings(GOOD + text)
     assert warning.endswith(
-        "rest.max_connections_per_source: 65 has no effect: max_connections is 64"
+        f"{section}.max_connections_per_source: 129 has no effect: max_connections is 128"
     )
 
 

@@ -158,6 +158,22 @@ def test_the_gateway_is_told_what_the_file_says(folder: Folder, tmp_path: Path) 
     assert settings.tls == Tls(ca=str(tmp_path / "p.yaml"))
 
 
+@pytest.mark.parametrize(
+    ("keys", "places"),
+    [
+        ("max_connections: 300", (300, 150)),
+        ("max_connections: 300, max_connections_per_source: 200", (300, 200)),
+        ("max_connections_per_source:", (128, None)),
+    ],
+)
+def test_an_address_has_half_of_the_places_of_the_gateway_unless_the_file_says_otherwise(
+    folder: Folder, keys: str, places: tuple[int, int | None]
+) -> None:
+    lines = "".join(f"  {key}\n" for key in keys.split(", "))
+    limits = gateway_settings(gateway_of(folder, GATEWAY + lines)).limits
+    assert (limits.connections, limits.connections_per_source) == places
+
+
 @pytest.mark.parametrize("source", ["127.0.0.0/8", "127.0.0.1", "::1"])
 def test_the_gateway_needs_no_tokens_for_this_machine(folder: Folder, source: str) -> None:
     text = GATEWAY[: GATEWAY.index("  tokens:")].replace("sources: [10.0.0.0/8]", "sources: [%s]")
@@ -203,6 +219,8 @@ def test_the_effective_configuration_shows_every_default(folder: Folder) -> None
         "  tokens:\n"
         f"    - {{name: panel, sha256: {HASH}}}\n"
         "  in_flight: 1\n"
+        "  max_connections: 128\n"
+        "  max_connections_per_source: 64\n"
         "  hosts: []\n"
         "outputs: {}\n"
     )
@@ -426,7 +444,8 @@ def test_a_line_of_a_listener_or_a_device_is_not_polled_for_subscribers(folder: 
         ("  access", "  in_flight: 65\n  access",
          "5: in_flight: found 65, allowed: an integer from 1 to 64"),
         ("  access", "  writes: true\n  access", "5: writes: unknown key, allowed: bind, sources, "
-         "allow, access, tokens, tls, device_tls, in_flight, hosts, compat"),
+         "allow, access, tokens, tls, device_tls, in_flight, max_connections, "
+         "max_connections_per_source, hosts, compat"),
         ("  access", "  compat: tentacle\n  access",
          "5: compat: found 'tentacle', allowed: port-of-call"),
         ("  access", "  compat:\n  access", "5: compat: found nothing, allowed: port-of-call"),

@@ -23,10 +23,11 @@ from holdfast.cli import main
 from holdfast.cli.services.gateway import _greeting_text
 from holdfast.client.url import NetworkTarget
 from holdfast.config.values.allow_entries import parse_allowed
-from holdfast.gateway import Settings, token_file
+from holdfast.gateway import GatewayLimits, Settings, token_file
 from support import cli, gateways, web, wire
 from support.fake_device import FakeDevice, exception, registers
 from support.gateways import PLC, Dialed, Names
+from support.machine import needs_127_0_0_2
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -460,6 +461,13 @@ def test_a_peer_from_elsewhere_gets_not_one_byte() -> None:
         wire.until(
             lambda: cast("Any", status()["connections"])["refused_source"] == 1, "it is counted"
         )
+
+
+@needs_127_0_0_2
+def test_one_source_can_not_take_all_places() -> None:
+    with gateways.running() as running:
+        places = GatewayLimits().connections
+        assert web.status_for_another(running.address, "/api/gateway", places) == 200
 
 
 @pytest.mark.parametrize("path", ["/", "/console/main.js", "/console/vendor/uplot/uPlot.esm.js"])

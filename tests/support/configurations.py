@@ -233,7 +233,16 @@ def gateway(draw: st.DrawFn) -> dict[str, Any]:
             st.fixed_dictionaries({"sources": SOURCES, "tokens": tokens()})
             | st.just({"sources": ["127.0.0.0/8", "::1"], "tokens": "none"})
         ),
-        **draw(st.fixed_dictionaries({}, optional={"in_flight": st.integers(1, 64)})),
+        **draw(
+            st.fixed_dictionaries(
+                {},
+                optional={
+                    "in_flight": st.integers(1, 64),
+                    "max_connections": CONNECTIONS,
+                    "max_connections_per_source": st.none() | CONNECTIONS,
+                },
+            )
+        ),
     }
 
 

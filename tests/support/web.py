@@ -264,6 +264,22 @@ def head(
     return "\r\n".join(lines).encode("latin-1")
 
 
+def status_for_another(address: tuple[str, int], path: str, places: int) -> int:
+    """Requests a path from 127.0.0.2 while 127.0.0.1 holds the places it can have, of `places`.
+
+    It has begun a request on each connection. Returns the status.
+    """
+    with contextlib.ExitStack() as held:
+        for _ in range(places):
+            connection = held.enter_context(wire.Connection(address))
+            with contextlib.suppress(ConnectionError):  # It is refused.
+                connection.send(head("GET", path)[:-2])
+        other = held.enter_context(wire.Connection(address, source="127.0.0.2"))
+        other.send(head("GET", path, "Connection: close"))
+        [answer] = answers(other.rest())
+    return answer.status
+
+
 def post(body: bytes, *headers: str) -> bytes:
     """Builds a whole ingest request."""
     length = f"Content-Length: {len(body)}"

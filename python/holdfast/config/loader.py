@@ -107,8 +107,9 @@ def _check(scope: Scope) -> None:
 def _warn(scope: Scope) -> None:
     """Warns about valid settings that have no effect, or probably a wrong one."""
     warn_of_listeners(scope)
-    if scope.config.rest is not None:
-        warn_of_source_limit(scope, ("rest",), scope.config.rest)
+    for name, service in (("rest", scope.config.rest), ("gateway", scope.config.gateway)):
+        if service is not None:
+            warn_of_source_limit(scope, (name,), service)
     warn_of_logs(scope)
     warn_of_devices(scope)
     warn_of_outputs(scope)

@@ -62,7 +62,11 @@ class Gateway:
             self._app,
             listener,
             sources=settings.sources,
-            limits=ConnectionLimits(settings.limits.connections, when_full="evict"),
+            limits=ConnectionLimits(
+                settings.limits.connections,
+                settings.limits.connections_per_source,
+                when_full="evict",
+            ),
             request_timeout=settings.limits.request_timeout,
             leaving=True,
             rejection=rejection,

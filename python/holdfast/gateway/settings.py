@@ -47,6 +47,8 @@ class GatewayLimits:
     """Requests in flight to one device."""
     connections: int = 128
     """Connections of HTTP clients."""
+    connections_per_source: int | None = 64
+    """Connections of HTTP clients with one address, so that it can't take all places."""
     request_timeout: float = 10.0
     """The timeout for receiving a request, and for sending a response."""
     ending: float = 0.7

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-LIMITS = ConnectionLimits(32, when_full="evict")
+LIMITS = ConnectionLimits(32, 16, when_full="evict")
 REQUEST_TIMEOUT_S = 10.0
 PATH = "/metrics"
 STATUSES = {"malformed": 400, "foreign_page": 403, "not_found": 404, "method_not_allowed": 405}

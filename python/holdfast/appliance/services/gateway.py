@@ -66,7 +66,11 @@ def gateway_settings(
         writes=settings.access == "read-write",
         tokens=tuple((token.name, bytes.fromhex(token.sha256)) for token in tokens),
         sources=settings.sources,
-        limits=GatewayLimits(in_flight=settings.in_flight),
+        limits=GatewayLimits(
+            in_flight=settings.in_flight,
+            connections=settings.max_connections,
+            connections_per_source=settings.max_connections_per_source,
+        ),
         profiles={name: profile.tag_list for name, profile in (profiles or {}).items()},
         hosts=frozenset(settings.hosts),
         compat=settings.compat,

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.checks.common import Scope
     from holdfast.config.models.listeners import Listener, Target
-    from holdfast.config.models.services import RestConfig
+    from holdfast.config.models.services import GatewayConfig, RestConfig
     from holdfast.config.text.yaml_document import KeyPath
     from holdfast.config.values.unit_keys import UnitKey
 
@@ -88,7 +88,7 @@ def warn_of_listeners(scope: Scope) -> None:
 
 
 def warn_of_source_limit(
-    scope: Scope, path: KeyPath, settings: ConnectionLimits | RestConfig
+    scope: Scope, path: KeyPath, settings: ConnectionLimits | RestConfig | GatewayConfig
 ) -> None:
     """Warns about a limit for one source that is above the limit for all."""
     most, of_source = settings.max_connections, settings.max_connections_per_source

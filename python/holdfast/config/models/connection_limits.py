@@ -14,8 +14,8 @@ FEW = 16
 """So many connections from one address are not limited by default."""
 
 
-def _per_source(data: dict[str, Any]) -> int:
-    """Leaves room for others: silent connections from one address can't fill the listener.
+def per_source(data: dict[str, Any]) -> int:
+    """Leaves room for others: silent connections from one address can't take all places.
 
     A listener for few connections often has a single client, or a gateway in front of all.
     """
@@ -28,7 +28,7 @@ class ConnectionLimits(Model):
 
     max_connections: Connections = DEFAULTS["max_connections"]
     """Maximum number of open connections."""
-    max_connections_per_source: Connections | None = Field(default_factory=_per_source)
+    max_connections_per_source: Connections | None = Field(default_factory=per_source)
     """Maximum number of open connections from one address; null: unlimited. Default: half of
     max_connections, but at least 16."""
     when_full: Literal["refuse", "evict"] = DEFAULTS["when_full"]

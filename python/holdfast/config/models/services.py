@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 from pydantic import AfterValidator, Discriminator, Field, Strict, Tag
 
 from holdfast.config.models.base import Model
+from holdfast.config.models.connection_limits import per_source
 from holdfast.config.models.server_tls import HttpsConfig
 from holdfast.config.models.tags import TagConfig
 from holdfast.config.text.raw_access import entries
@@ -117,10 +118,11 @@ class RestConfig(Model):
     sessions; only on a loopback address."""
     max_body: Annotated[int, Field(ge=1024, le=2**30)] = 8 * 2**20
     """Maximum number of bytes in the body of a request."""
-    max_connections: Connections = 64
+    max_connections: Connections = 128
     """Maximum number of open connections."""
-    max_connections_per_source: Connections | None = None
-    """Maximum number of open connections from one address; null: unlimited."""
+    max_connections_per_source: Connections | None = Field(default_factory=per_source)
+    """Maximum number of open connections from one address; null: unlimited. Default: half of
+    max_connections, but at least 16."""
     when_full: Literal["refuse", "evict"] = "evict"
     """At the limit: refuse closes the new connection, evict the connection idle longest."""
     request_timeout: Duration = 10.0
@@ -346,6 +348,11 @@ class GatewayConfig(Model):
     """Certificates for TLS connections to devices."""
     in_flight: Annotated[int, Field(ge=1, le=64)] = 1
     """Maximum number of requests in flight to one device."""
+    max_connections: Connections = 128
+    """Maximum number of open connections of clients."""
+    max_connections_per_source: Connections | None = Field(default_factory=per_source)
+    """Maximum number of open connections from one address; null: unlimited. Default: half of
+    max_connections, but at least 16."""
     hosts: Annotated[tuple[HostName, ...], Strict(False)] = ()
     """With tokens none: the names under which the gateway may be reached."""
     compat: Annotated[Compat | None, NotNull()] = None
