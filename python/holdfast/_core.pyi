@@ -53,7 +53,6 @@ __all__ = [
     "RETRY_PAUSES_S",
     "SUB_FUNCTIONS",
     "TLS_REASONS",
-    "TURNAROUND_S",
     "UNMEASURED_COST_MS",
     "WRITE_RECORDS",
     "WRITE_TIMEOUT_S",
@@ -112,9 +111,6 @@ ADDRESSES: Final[int]
 
 MAX_PDU: Final[int]
 """Maximum size of a request or reply in bytes, without the framing of a transport."""
-
-TURNAROUND_S: Final[float]
-"""The time for devices to carry out a broadcast."""
 
 AREAS: Final[tuple[Area, ...]]
 """The areas, in the order of their functions."""
@@ -958,9 +954,6 @@ class Request:
 
     def as_multiple(self) -> Request | None:
         """The same write with function 15 or 16, if this is one of a single coil or register."""
-
-    def rtu_frame(self, unit: int) -> bytes:
-        """The RTU frame to one unit id (Modbus over Serial Line V1.02, 2.5.1)."""
 
 @final
 class Endpoint:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import queue
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
+import holdfast
+from holdfast import _core
+from holdfast.gateway.broadcast import send
 from support import gateways, lines, wire
 from support.fake_device import HANG_UP, FakeDevice, Stream, Udp, silent
 
@@ -171,3 +175,16 @@ def test_over_tcp_unit_0_is_a_unit_as_any(gateway: Running) -> None:
     assert answer.json["error"] == (
         "Connection timeout: unit id 0 is the broadcast of serial lines, which has no response"
     )
+
+
+def test_a_broadcast_without_a_connection_is_not_sent() -> None:
+    class Unconnected:
+        async def call(self, *_: Any) -> None:
+            raise holdfast.RequestTimeout("no connection", maybe_sent=False)
+
+        async def close(self) -> None:
+            pass
+
+    request = _core.Request.write_register(0, 1)
+    with pytest.raises(holdfast.RequestTimeout, match="no connection"):
+        asyncio.run(send(cast("Any", Unconnected()), request, 1.0))

@@ -13,7 +13,6 @@ use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{LineDirection, LineMode, LineParity, SerialLine};
 use holdfast_memory::{Area, Span};
 use holdfast_protocol::client::{AcceptUnit, Closed, Echo, Tolerance};
-use holdfast_protocol::frame::rtu;
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
     self, Bits, Diagnostics, EncodedRequest, ExceptionCode, FileRange, FileRanges, FileRecords,
@@ -200,13 +199,6 @@ impl Request {
 
     fn as_multiple(&self) -> Option<Request> {
         self.encoded.as_multiple().map(|encoded| Request { encoded })
-    }
-
-    fn rtu_frame<'py>(&self, py: Python<'py>, unit: Integer) -> PyResult<Bound<'py, PyBytes>> {
-        let unit = byte("unit", unit.0)?;
-        let mut frame = [0; rtu::MAX_LEN];
-        let len = rtu::encode(unit, self.encoded.pdu(), &mut frame).expect("a request is a PDU");
-        Ok(PyBytes::new(py, &frame[..len]))
     }
 }
 

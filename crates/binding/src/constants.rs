@@ -6,7 +6,7 @@ use holdfast_engine::poller::UNMEASURED_COST_MS;
 use holdfast_engine::tls::TlsFailure;
 use holdfast_journal::log::{CONTACTS_PER_LAG, MAX_LAG, WRITE_TIMEOUT};
 use holdfast_memory::{Area, Span};
-use holdfast_protocol::client::{MAX_LATENESS, TURNAROUND};
+use holdfast_protocol::client::MAX_LATENESS;
 use holdfast_protocol::pdu::{self, ExceptionCode, Function, SubFunction, limit};
 use holdfast_runtime::Retry;
 use pyo3::prelude::*;
@@ -16,7 +16,6 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let py = module.py();
     module.add("ADDRESSES", Span::MAX_SIZE)?;
     module.add("MAX_PDU", pdu::MAX_LEN)?;
-    module.add("TURNAROUND_S", TURNAROUND.as_secs_f64())?;
     module.add("READ_RECORDS", limit::READ_RECORDS)?;
     module.add("WRITE_RECORDS", limit::WRITE_RECORDS)?;
     module.add("LAST_RECORD", limit::LAST_RECORD)?;

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import TYPE_CHECKING
 
 from holdfast.errors import InvalidResponse, ModbusException, RequestTimeout
@@ -28,8 +27,10 @@ async def send(transport: AsyncTransport, request: Request, timeout: float) -> N
     """Sends a broadcast on a new connection, and waits as long as devices may need."""
     try:
         # The caller's own timeout must not expire first: it is an error.
-        with contextlib.suppress(RequestTimeout):
-            await transport.call(request, 0, min(timeout / 2, LONGEST_S))
+        await transport.call(request, 0, min(timeout / 2, LONGEST_S))
+    except RequestTimeout as error:
+        if not error.maybe_sent:
+            raise
     except ModbusException as error:
         raise InvalidResponse(f"the peer answered a broadcast with {error}") from None
     finally:
