@@ -574,6 +574,25 @@ def test_a_broadcast_on_a_serial_line_has_no_reply(on_line: OnLine, connect: Con
     ]
 
 
+@pytest.mark.parametrize("request_", ["0300050001", "170003000100010001020007", "080001ff00", "41"])
+def test_only_a_write_is_broadcast_on_a_serial_line(
+    on_line: OnLine, connect: Connect, request_: str
+) -> None:
+    asked = bytes.fromhex(request_)
+    front = connect(scada(on_line.appliance))
+
+    assert front.ask(asked, unit=0) == exception(asked, 1)
+    assert front.ask(READ) == FIVE
+    assert [asked.unit for asked in on_line.device.requests] == [1]
+
+
+def test_unit_0_behind_tcp_is_a_unit_like_any_other(
+    unmodelled: FakeDevice, run: Run, connect: Connect
+) -> None:
+    unmodelled.answer = lambda _: FIVE
+    assert connect(scada(run(configuration(unmodelled.url)))).ask(READ, unit=0) == FIVE
+
+
 def test_clients_of_a_serial_line_never_overlap(on_line: OnLine) -> None:
     def ask(number: int) -> bool:
         with wire.Connection(scada(on_line.appliance)) as front:

@@ -7,12 +7,12 @@ use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 
 use holdfast_protocol::client::Tolerance;
-use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
+use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, Function};
 use holdfast_runtime::{Retry, lock};
 use tokio::sync::mpsc;
 
 use super::caller::{Caller, Waiting};
-use crate::client::{ClientError, Endpoint, StrayCounters};
+use crate::client::{self, ClientError, Endpoint, StrayCounters};
 use crate::counter::counters;
 use crate::link::limits::permit::Wanted;
 use crate::link::limits::queue_share::{Place, QueueShare, Source};
@@ -76,6 +76,8 @@ pub struct SharedLink {
     pub counters: LinkCounters,
     calls: mpsc::UnboundedSender<Call>,
     queue: Arc<QueueShare>,
+    /// Whether unit id 0 is the broadcast.
+    has_broadcasts: bool,
     strays: OnceLock<Arc<StrayCounters>>,
     error: Mutex<Option<Arc<ClientError>>>,
     preferred: Vec<IpAddr>,
@@ -134,6 +136,7 @@ impl SharedLink {
             counters: LinkCounters::default(),
             calls,
             queue: QueueShare::new(settings.queue),
+            has_broadcasts: matches!(settings.endpoint.place, client::Place::Serial(_)),
             strays: OnceLock::new(),
             error: Mutex::default(),
             preferred: settings.preferred.clone(),
@@ -228,13 +231,21 @@ impl Route {
     ) -> Result<PendingReply, ExceptionCode> {
         let link = &self.link;
         link.counters.requests.add();
+        let unit_id = self.unit_id.unwrap_or(unit_id);
+        // No unit may answer it. The reply of one that does would be taken for the reply to the next request.
+        if link.has_broadcasts
+            && unit_id == 0
+            && !Function::from_pdu(pdu).is_some_and(Function::can_be_broadcast)
+        {
+            return Err(ExceptionCode::IllegalFunction);
+        }
         let request = EncodedRequest::opaque(pdu).ok_or(ExceptionCode::IllegalFunction)?;
         let place = link.admitted(link.queue.place(Source::client(asker.peer)));
         let place = place.ok_or(ExceptionCode::ServerDeviceBusy)?;
         let priority = Priority::of(&request, asker.peer, &link.preferred);
         let (to, pending) = pending_reply();
         let call = Call {
-            unit_id: self.unit_id.unwrap_or(unit_id),
+            unit_id,
             request,
             source: asker.source,
             priority,

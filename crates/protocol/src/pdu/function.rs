@@ -59,6 +59,12 @@ impl Function {
                 | Function::ReadWriteMultipleRegisters
         )
     }
+
+    /// Whether a request to all units of a serial line may have the function: it writes, and returns no values
+    /// (Modbus over Serial Line V1.02, 2.1).
+    pub fn can_be_broadcast(self) -> bool {
+        self.is_write() && self != Function::ReadWriteMultipleRegisters
+    }
 }
 
 codes! {

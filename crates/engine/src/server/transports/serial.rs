@@ -348,11 +348,7 @@ impl ModbusSerial {
 
     /// Carries out a broadcast: every memory carries out the write, no unit replies.
     async fn broadcast(&self, context: &ListenerContext, request: &[u8]) {
-        let function = Function::from_pdu(request);
-        let wanted = function.is_some_and(|function| {
-            function.is_write() && function != Function::ReadWriteMultipleRegisters
-        });
-        if !wanted {
+        if !Function::from_pdu(request).is_some_and(Function::can_be_broadcast) {
             self.unit_server.counters.frames.other_unit.add();
             return;
         }
