@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use holdfast_protocol::client::{
     AcceptUnit, Attempt, BUSY_PAUSE, Closed, Connection, Done, Echo, Failure, GUARD,
-    InvalidResponse, MAX_STRAY_DATAGRAMS, Strays, Ticket, Tolerance, Transport,
+    InvalidResponse, MAX_STRAY_DATAGRAMS, Strays, TURNAROUND, Ticket, Tolerance, Transport,
 };
 use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
 use holdfast_protocol::pdu::{self, EncodedRequest, Range, Request, Response, ResponseError};
@@ -34,6 +34,8 @@ const STRICT: Tolerance = Tolerance {
     reconnect: Duration::ZERO,
     write_multiple: false,
 };
+
+type Framed = fn(u8, &[u8]) -> Vec<u8>;
 
 /// The result of a request: registers as bytes, empty for a write.
 type Got = (Ticket, Result<Vec<u8>, Failure>);
@@ -640,6 +642,55 @@ fn nobody_replies_to_a_broadcast_of_a_serial_line() {
         assert_eq!(client.got(), []);
         client.after(turnaround / 2);
         assert_eq!(client.got(), [(ticket, Ok(vec![]))]);
+    }
+}
+
+/// A serial line whose broadcast of a write has just ended.
+fn after_broadcast(transport: Transport) -> Client {
+    let mut client = Client::new(transport);
+    client.connection.send(0, &EncodedRequest::new(&WRITE), SECOND, client.now).unwrap();
+    client.outgoing();
+    client.after(TURNAROUND);
+    assert_eq!(client.got().len(), 1);
+    client
+}
+
+#[test]
+fn a_confirmation_of_a_broadcast_does_not_end_the_next_write() {
+    let other = Request::WriteSingleRegister { address: 3, value: 8 };
+    for unit_id in [0, 7] {
+        for (transport, frame) in [(RTU, rtu_frame as Framed), (ASCII, ascii_frame)] {
+            let mut client = after_broadcast(transport);
+            let ticket = client.send(other);
+            client.after(SILENCE);
+            assert!(!client.outgoing().is_empty(), "no confirmation can be taken for its reply");
+            client.after(SECOND / 2);
+            client.receive(&frame(unit_id, &[6, 0, 3, 0, 7]));
+            assert_eq!(client.got(), []);
+            client.receive(&frame(7, &[6, 0, 3, 0, 8]));
+            client.after(SECOND / 2);
+            assert_eq!(client.got(), [(ticket, Ok(vec![]))]);
+        }
+    }
+}
+
+#[test]
+fn a_write_with_the_confirmation_of_a_broadcast_waits_until_that_can_not_come() {
+    for is_confirmed in [true, false] {
+        for (transport, frame) in [(RTU, rtu_frame as Framed), (ASCII, ascii_frame)] {
+            let mut client = after_broadcast(transport);
+            client.send(WRITE);
+            client.after(SECOND / 2);
+            assert_eq!(client.outgoing(), []);
+            if is_confirmed {
+                client.receive(&frame(7, &[6, 0, 3, 0, 7]));
+                client.after(GUARD);
+            } else {
+                client.after(SECOND / 2 - TURNAROUND);
+            }
+            assert_eq!(client.outgoing(), frame(7, &[6, 0, 3, 0, 7]));
+            assert_eq!(client.got(), []);
+        }
     }
 }
 

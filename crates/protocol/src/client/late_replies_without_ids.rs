@@ -99,6 +99,8 @@ struct Recent {
 pub(super) struct Unanswered {
     pub(super) unit_id: u8,
     pub(super) request: EncodedRequest,
+    /// Units confirm broadcasts only by mistake, each with its own id.
+    pub(super) is_broadcast: bool,
     sent: Time,
     /// The reply may come until then.
     until: Time,
@@ -115,6 +117,8 @@ pub(super) enum Ended {
     Other,
     /// By bytes that may have been its reply.
     Damaged,
+    /// It has no reply.
+    Broadcast,
 }
 
 /// Whether replies may come twice.
@@ -146,6 +150,9 @@ impl LateReplies {
         self.expire(now);
         let accepted = tolerance.accept_unit;
         let alike = self.unanswered.iter().filter(|earlier| {
+            if earlier.is_broadcast {
+                return confirmation(&earlier.request) == confirmation(request);
+            }
             let same_unit = accepted != AcceptUnit::Requested || earlier.unit_id == unit_id;
             same_unit && may_confuse(&earlier.request, request, tolerance.pad)
         });
@@ -251,6 +258,7 @@ impl LateReplies {
                     .max(took * (LATENESS_FACTOR - 1))
                     .min(MAX_LATENESS)
             }
+            Ended::Broadcast => sent + timeout,
             Ended::Damaged => (sent + timeout).min(now + usual.unwrap_or(WAIT_AFTER_DAMAGED_REPLY)),
         }
     }
@@ -292,8 +300,9 @@ impl LateReplies {
         if self.unanswered.len() == MAX_UNANSWERED_REQUESTS {
             self.unanswered.pop_front();
         }
-        let request = request.clone();
-        self.unanswered.push_back(Unanswered { unit_id, request, sent, until, from: Time::ZERO });
+        let (request, is_broadcast) = (request.clone(), how == Ended::Broadcast);
+        let from = Time::ZERO;
+        self.unanswered.push_back(Unanswered { unit_id, request, is_broadcast, sent, until, from });
     }
 
     /// The longest time of a reply of this unit that was not late.
@@ -368,6 +377,15 @@ impl LateReplies {
 fn may_confuse(earlier: &EncodedRequest, other: &EncodedRequest, pads: bool) -> bool {
     let same_function = earlier.pdu().first() == other.pdu().first();
     same_function && (pads || read_bytes(earlier) == read_bytes(other))
+}
+
+/// The PDU that confirms a write: it repeats the request, but not its values if it may have several
+/// (V1.1b3, 6.11 and 6.12).
+pub(super) fn confirmation(request: &EncodedRequest) -> &[u8] {
+    match request.pdu() {
+        [15 | 16, range @ ..] if range.len() > 4 => &request.pdu()[..5],
+        pdu => pdu,
+    }
 }
 
 /// The number of bytes that a read asks for; `None` for any other request.

@@ -10,7 +10,7 @@ use core::time::Duration;
 use super::attempts::Attempt;
 use super::echo::Echo;
 use super::flights::{Call, Done, Flight, Flights, Ticket};
-use super::late_replies_without_ids::{Ended, GUARD, LateReplies};
+use super::late_replies_without_ids::{Ended, GUARD, LateReplies, Unanswered, confirmation};
 use super::{Closed, Failure, InvalidResponse, Time};
 use crate::frame::{FrameError, ascii, rtu};
 use crate::pdu::{self, EncodedRequest, ExceptionCode, Response, ResponseError};
@@ -302,25 +302,22 @@ impl OneAtATime {
     fn late_reply(&self, pads: bool) -> Option<(usize, usize, usize)> {
         let mut unanswered = self.late_replies.unanswered().enumerate();
         unanswered.find_map(|(place, earlier)| {
-            let (unit_id, request) = (earlier.unit_id, &earlier.request);
             (0..self.received.len()).find_map(|at| {
-                let len = self.reply_to(unit_id, request, pads, &self.received[at..])?;
+                let len = self.reply_to(earlier, pads, &self.received[at..])?;
                 Some((place, at, len))
             })
         })
     }
 
     /// The length of the reply that `bytes` begin with, if it answers this request. One with an exception
-    /// answers any request of its function.
-    fn reply_to(
-        &self,
-        unit_id: u8,
-        request: &EncodedRequest,
-        pads: bool,
-        bytes: &[u8],
-    ) -> Option<usize> {
+    /// answers any request of its function, but no broadcast: it may be the reply to the next request.
+    fn reply_to(&self, earlier: &Unanswered, pads: bool, bytes: &[u8]) -> Option<usize> {
+        let Unanswered { unit_id, ref request, is_broadcast, .. } = *earlier;
         let function = *request.pdu().first()?;
         let is_its = |(unit, pdu): (u8, &[u8])| {
+            if is_broadcast {
+                return pdu == confirmation(request);
+            }
             let is_of_function = pdu.first().is_some_and(|code| code & 0x7F == function);
             // A request that reads another number of bytes may wait for its own reply.
             let fits = pads || !matches!(request.response(pdu), Err(ResponseError::Length));
@@ -328,7 +325,8 @@ impl OneAtATime {
         };
         match self.framing {
             Framing::Rtu => {
-                if bytes.len() < 2 || bytes[0] != unit_id || bytes[1] & 0x7F != function {
+                let is_unit = is_broadcast || bytes[0] == unit_id;
+                if bytes.len() < 2 || !is_unit || bytes[1] & 0x7F != function {
                     return None;
                 }
                 let len = response_len(bytes, request).ok()??;
@@ -593,6 +591,11 @@ impl OneAtATime {
     ) {
         if let State::Turnaround { until } = self.state {
             if until <= now {
+                if let Some(flight) = flights.first() {
+                    let times = (flight.sent, self.timeout);
+                    let request = (flight.unit_id, &flight.request);
+                    self.late_replies.ended(request, times, Ended::Broadcast, now);
+                }
                 self.rest(now);
                 flights.finish(Ok(Response::Written), sink);
             }
