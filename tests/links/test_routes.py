@@ -380,16 +380,21 @@ def test_a_client_without_transaction_ids_that_asks_again_gets_no_earlier_reply(
         assert front.is_quiet()
 
 
-def test_a_broadcast_is_sent_although_its_client_asks_again(device: Stream, run: Run) -> None:
+@pytest.mark.parametrize("kind", ["rtu", "rtu-udp"])
+def test_only_a_broadcast_is_sent_although_its_client_asks_again(
+    device: Stream, run: Run, kind: str
+) -> None:
     held = Held()
     device.script = [held]
-    appliance = run(configuration(device.url, kind="rtu"))
-    frame = TRANSPORTS["rtu"].frame
-    with client("rtu", scada(appliance)) as other, client("rtu", scada(appliance)) as front:
-        assert isinstance(front, FramedConnection)
+    appliance = run(configuration(device.url, kind=kind))
+    frame = TRANSPORTS[kind].frame
+    to = scada(appliance)
+    with client(kind, to, "127.0.0.2") as other, client(kind, to) as front:
+        assert isinstance(front, FramedConnection | Datagrams)
         other.send(frame(READ))
         device.await_requests(1)
-        front.send(frame(WRITE, 2) + frame(WRITE, 0))
+        front.send(frame(WRITE, 2))
+        front.send(frame(WRITE, 0))
         await_count(appliance, "waiting", 3)
         assert pauses(front)
         front.send(frame(READ))

@@ -29,7 +29,7 @@ from support.fake_device import Stream, good
 from support.lines import ASCII, RTU, UNIT, Cable, Line, Mode
 from support.machine import tool
 from support.pymodbus_peer import OPTIONS, Patient, connected, tour
-from support.routed import Held
+from support.routed import Held, await_count
 from support.running import content
 from support.transports import ALL
 from support.vectors import cases, overlay
@@ -385,6 +385,26 @@ def test_a_reply_that_a_master_no_longer_waits_for_is_not_sent(start: Start) -> 
             assert reply == (UNIT, bytes.fromhex("03020005"))
             assert plant.line.receive() == (UNIT, bytes.fromhex("03020006"))
     raise AssertionError("replies came that nobody waits for")
+
+
+def test_a_write_that_a_master_no_longer_waits_for_is_not_sent(start: Start) -> None:
+    held = Held()
+    with Stream("tcp", held) as device:
+        plant = start(
+            units={UNIT: {"route": "meter"}, UNIT + 1: "plant"},
+            devices={"meter": {"url": device.url, "unit": 1, "timeout": wire.DEADLINE}},
+        )
+        frame = plant.line.mode.frame
+        plant.line.send(frame(READ, UNIT))
+        device.await_requests(1)
+        plant.line.send(frame(WRITE, UNIT))
+        await_count(plant.appliance, "waiting", 2, "meter")
+        assert plant.line.ask(READ, UNIT + 1) == ZERO
+        held.release()
+        await_count(plant.appliance, "withdrawn", 1, "meter")
+        await_count(plant.appliance, "waiting", 0, "meter")
+        assert plant.line.is_quiet()
+    assert [asked.pdu for asked in device.requests] == [READ]
 
 
 @only_rtu

@@ -25,6 +25,13 @@ struct Client {
     gone: Notify,
 }
 
+impl Client {
+    fn give_up(&self) {
+        self.is_gone.store(true, Ordering::Relaxed);
+        self.gone.notify_one();
+    }
+}
+
 /// The reply to a request.
 #[derive(Debug, Default)]
 pub(crate) struct Reply {
@@ -32,6 +39,15 @@ pub(crate) struct Reply {
     pub(crate) pdu: Vec<u8>,
     /// The sequence of the write in the log of a memory. `None` without a log.
     pub(crate) log_sequence: Option<u64>,
+}
+
+/// Gives a reply up when it is dropped.
+pub(crate) struct GivesUp(Arc<Client>);
+
+impl Drop for GivesUp {
+    fn drop(&mut self) {
+        self.0.give_up();
+    }
 }
 
 /// Where a reply goes.
@@ -80,8 +96,12 @@ impl PendingReply {
     /// The client has disconnected: a request that waits for its turn is not sent. The reply to one that
     /// was sent still comes, because the audit log records it.
     pub(crate) fn give_up(&self) {
-        self.client.is_gone.store(true, Ordering::Relaxed);
-        self.client.gone.notify_one();
+        self.client.give_up();
+    }
+
+    /// As [`give_up`](PendingReply::give_up), when the result is dropped.
+    pub(crate) fn give_up_on_drop(&self) -> GivesUp {
+        GivesUp(Arc::clone(&self.client))
     }
 
     /// Blocks the calling thread until the reply comes.

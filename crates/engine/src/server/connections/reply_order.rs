@@ -231,7 +231,8 @@ impl Asked {
     }
 
     /// Waits for the reply, and counts and records it: in a task of its own, which goes on if the caller does not.
-    /// The engine waits until `running` is dropped.
+    /// A caller that drops the result has given up: a request that waits for its turn is not sent. The engine waits
+    /// until `running` is dropped.
     pub(in crate::server) fn answered(
         self,
         pending: PendingReply,
@@ -239,13 +240,17 @@ impl Asked {
         peer: Option<Peer>,
         running: watch::Receiver<bool>,
     ) -> impl Future<Output = Reply> + use<> {
+        let gives_up = pending.give_up_on_drop();
         let answering = tokio::spawn(async move {
             let reply = self.count(&unit_server, pending.await.ok());
             self.record(&context, peer.as_ref(), &reply);
             drop(running);
             reply
         });
-        async move { answering.await.unwrap_or_default() }
+        async move {
+            let _gives_up = gives_up;
+            answering.await.unwrap_or_default()
+        }
     }
 
     /// Counts the reply, and returns it. `None` means that the link has ended.

@@ -199,7 +199,8 @@ impl ModbusSerial {
             return Ok(());
         };
         let answer = self.answer(serving, unit_id, request, buffer);
-        let Some(len) = unless_newer(answer, Input::Rtu(line), port).await? else {
+        let is_broadcast = unit_id == BROADCAST;
+        let Some(len) = unless_newer(answer, is_broadcast, Input::Rtu(line), port).await? else {
             return Ok(());
         };
         let len = Rtu::complete(&mut reply, 0, unit_id, len);
@@ -284,7 +285,8 @@ impl ModbusSerial {
         echo.request();
         let mut buffer = [0; pdu::MAX_LEN];
         let answer = self.answer(serving, unit_id, request, &mut buffer);
-        let Some(len) = unless_newer(answer, Input::Ascii(input), port).await? else {
+        let is_broadcast = unit_id == BROADCAST;
+        let Some(len) = unless_newer(answer, is_broadcast, Input::Ascii(input), port).await? else {
             return Ok(());
         };
         let mut reply = [0; ascii::MAX_LEN];
@@ -364,22 +366,24 @@ impl ModbusSerial {
     }
 }
 
-/// Waits for a reply. Returns its length; `None` if there is none, or if another request has come meanwhile: the
-/// master has given up, and would take it for the reply to that one.
+/// Waits for a reply. Returns its length; `None` if there is none, or as soon as another request comes: the
+/// master has given up, and would take it for the reply to that one. A broadcast has no reply to give up.
 async fn unless_newer(
     answer: impl Future<Output = Option<usize>>,
+    is_broadcast: bool,
     mut input: Input<'_>,
     port: &SerialPort,
 ) -> io::Result<Option<usize>> {
     let mut answer = std::pin::pin!(answer);
-    let (mut is_newer, mut lost) = (false, None);
+    let mut lost = None;
     loop {
         tokio::select! {
             biased;
-            len = &mut answer => return lost.map_or(Ok(len.filter(|_| !is_newer)), Err),
+            len = &mut answer => return lost.map_or(Ok(len), Err),
             received = input.receive(port), if lost.is_none() => match received {
                 // Whatever follows the request: another unit may answer it.
-                Ok(()) => is_newer |= input.has_request(),
+                Ok(()) if !is_broadcast && input.has_request() => return Ok(None),
+                Ok(()) => {}
                 Err(error) => lost = Some(error),
             },
         }

@@ -17,7 +17,7 @@ use tokio::net::UdpSocket;
 use tokio::sync::watch;
 use tokio::task::{JoinSet, yield_now};
 
-use crate::link::{Asker, source};
+use crate::link::{Asker, Reply, source};
 use crate::server::connections::deadlines::BURST_TIME;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
@@ -195,8 +195,8 @@ impl ModbusUdp {
         let Some(buffer) = output[D::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return 0;
         };
-        if let Some(newest) = later.newest.get_mut(&peer) {
-            newest.0 = Instant::now();
+        if let Some((newest, _)) = later.newest.get(&peer) {
+            newest.send_replace(Instant::now());
         }
         if D::HAS_IDS && later.repeats(peer, (tag, unit_id, request)) {
             return 0;
@@ -213,15 +213,14 @@ impl ModbusUdp {
             context.note_refused(refused, &Reported::default(), Some(&peer.into()));
             return match reply {
                 Expected::Pending(pending) => {
-                    let (meta, now) = (*meta, Instant::now());
                     let ours = (Arc::clone(&self.unit_server), Arc::clone(context));
                     let reply =
                         asked.answered(pending, ours, Some(peer.into()), later.running.clone());
-                    later.begin(&asker, (peer, now), async move {
-                        Completed { meta, asked: now, tag, unit_id, pdu: reply.await.pdu }
-                    });
-                    let sent = Sent { asked: now, unit_id, request: request.to_vec(), times: 1 };
+                    let asked = Instant::now();
+                    let sent = Sent { asked, unit_id, request: request.to_vec(), times: 1 };
                     later.sent.insert((peer, tag), sent);
+                    let pending = Completed { meta: *meta, asked, tag, unit_id, pdu: Vec::new() };
+                    later.begin(&asker, pending, D::HAS_IDS, reply);
                     0
                 }
                 Expected::Known(reply) => {
@@ -243,7 +242,7 @@ struct Later {
     /// The clients that wait for replies.
     clients: HashMap<IpAddr, Client>,
     /// For each peer that waits, when its newest request came, and for how many replies it waits.
-    newest: HashMap<SocketAddr, (Instant, usize)>,
+    newest: HashMap<SocketAddr, (watch::Sender<Instant>, usize)>,
     /// By peer and transaction id, the newest request that waits for its reply.
     sent: HashMap<(SocketAddr, u16), Sent>,
     replies: JoinSet<Completed>,
@@ -286,16 +285,37 @@ impl Later {
         MAX_PENDING_REPLIES.saturating_sub(self.replies.len()) <= self.waiting(address)
     }
 
+    /// Waits for a reply. Without transaction ids, a peer that asks again after a pause has given it up: it would
+    /// take the reply for the one to the newer request.
     fn begin(
         &mut self,
         asker: &Asker,
-        (peer, now): (SocketAddr, Instant),
-        completed: impl Future<Output = Completed> + Send + 'static,
+        pending: Completed,
+        has_ids: bool,
+        reply: impl Future<Output = Reply> + Send + 'static,
     ) {
+        let (peer, asked) = (pending.meta.addr, pending.asked);
         let client = Client { source: asker.source, waiting: 0 };
         self.clients.entry(peer.ip()).or_insert(client).waiting += 1;
-        self.newest.entry(peer).or_insert((now, 0)).1 += 1;
-        self.replies.spawn(completed);
+        let newest = self.newest.entry(peer).or_insert_with(|| (watch::Sender::new(asked), 0));
+        newest.1 += 1;
+        let mut newest = newest.0.subscribe();
+        self.replies.spawn(async move {
+            let is_late = |newest: &Instant| newest.duration_since(asked) > BURST_TIME;
+            let given_up = async { newest.wait_for(is_late).await.map(drop) };
+            let mut reply = std::pin::pin!(reply);
+            tokio::select! {
+                biased;
+                reply = &mut reply => Completed { pdu: reply.pdu, ..pending },
+                Ok(()) = given_up, if !has_ids => {
+                    // A broadcast has no reply to give up: it is sent.
+                    if pending.unit_id == 0 {
+                        reply.await;
+                    }
+                    pending
+                }
+            }
+        });
     }
 
     /// Whether a peer sends a request again before its reply, as on a
@@ -318,23 +338,20 @@ impl Later {
         }
     }
 
-    /// A reply has come to what a peer asked at that time. Returns whether the peer has asked again after a
-    /// pause: then it has given up.
-    fn end(&mut self, peer: SocketAddr, asked: Instant) -> bool {
+    /// A peer waits for one reply less.
+    fn end(&mut self, peer: SocketAddr) {
         if let Entry::Occupied(mut client) = self.clients.entry(peer.ip()) {
             client.get_mut().waiting -= 1;
             if client.get().waiting == 0 {
                 client.remove();
             }
         }
-        let Entry::Occupied(mut entry) = self.newest.entry(peer) else { return false };
-        let (newest, waiting) = entry.get_mut();
-        *waiting -= 1;
-        let is_late = newest.duration_since(asked) > BURST_TIME;
-        if *waiting == 0 {
-            entry.remove();
+        if let Entry::Occupied(mut peer) = self.newest.entry(peer) {
+            peer.get_mut().1 -= 1;
+            if peer.get().1 == 0 {
+                peer.remove();
+            }
         }
-        is_late
     }
 }
 
@@ -344,16 +361,16 @@ struct Completed {
     asked: Instant,
     tag: u16,
     unit_id: u8,
+    /// Empty if nothing is to be sent.
     pdu: Vec<u8>,
 }
 
-/// Sends the reply of a device. Without transaction ids, one that its peer has given up is dropped: it would
-/// be taken for the reply to the newer request.
+/// Sends the reply of a device.
 fn complete<D: Datagram>(socket: &Datagrams, completed: Completed, later: &mut Later) {
     let Completed { meta, asked, tag, unit_id, pdu } = completed;
-    let is_late = later.end(meta.addr, asked);
+    later.end(meta.addr);
     let times = later.times(meta.addr, tag, asked);
-    if !pdu.is_empty() && (D::HAS_IDS || !is_late) {
+    if !pdu.is_empty() {
         let mut frame = [0; MAX_FRAME_LEN];
         frame[D::HEADER_LEN..][..pdu.len()].copy_from_slice(&pdu);
         let len = D::complete(&mut frame, tag, unit_id, pdu.len());
@@ -407,41 +424,54 @@ mod tests {
     use crate::server::requests::identity::Identity;
     use crate::server::rights::functions::{AccessMode, Functions};
 
+    fn unanswered(peer: SocketAddr) -> Completed {
+        let mut meta = RecvMeta::default();
+        meta.addr = peer;
+        Completed { meta, asked: Instant::now(), tag: 0, unit_id: 1, pdu: Vec::new() }
+    }
+
     #[test]
     fn a_client_leaves_pending_replies_to_others_and_is_forgotten_after_its_last_one() {
         let [one, other] = [1, 2].map(|last| IpAddr::from([127, 0, 0, last]));
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let _context = runtime.enter();
         let mut later = Later::new(watch::channel(false).1);
-        let (first, now) = (later.asker(one), Instant::now());
+        let first = later.asker(one);
         let peer = SocketAddr::from((one, 1));
-        later.begin(&first, (peer, now), std::future::pending());
+        later.begin(&first, unanswered(peer), false, std::future::pending());
         while !later.is_full(one) {
             let asker = later.asker(one);
             assert_eq!(asker.source, first.source);
-            later.begin(&asker, (peer, now), std::future::pending());
+            later.begin(&asker, unanswered(peer), false, std::future::pending());
         }
         assert_eq!(later.replies.len(), MAX_PENDING_REPLIES / 2);
         let asker = later.asker(other);
         assert_eq!((later.waiting(other), later.is_full(other)), (0, false));
         assert_ne!(asker.source, first.source);
-        assert!((0..later.waiting(one)).all(|_| !later.end(peer, now)));
+        (0..later.waiting(one)).for_each(|_| later.end(peer));
         assert!(later.clients.is_empty() && later.newest.is_empty());
     }
 
     #[test]
-    fn a_reply_is_late_if_its_peer_has_asked_again_after_a_pause() {
+    fn a_peer_that_asks_again_after_a_pause_has_given_up_the_replies_before() {
         let [one, other] = [1, 2].map(|port| SocketAddr::from(([127, 0, 0, 1], port)));
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
-        let _context = runtime.enter();
         let mut later = Later::new(watch::channel(false).1);
-        let (asker, first) = (later.asker(one.ip()), Instant::now());
-        for (peer, asked) in [(one, first), (one, first + BURST_TIME), (other, first)] {
-            later.begin(&asker, (peer, asked), std::future::pending());
-        }
-        later.newest.get_mut(&one).unwrap().0 = first + BURST_TIME * 2;
-        assert!(later.end(one, first));
-        assert!(!later.end(one, first + BURST_TIME) && !later.end(other, first));
+        let asker = later.asker(one.ip());
+        let given_up: Vec<_> = runtime.block_on(async {
+            for (peer, has_ids) in [(other, false), (one, true), (one, false)] {
+                later.begin(&asker, unanswered(peer), has_ids, std::future::pending());
+            }
+            let first = Instant::now();
+            for asked_again in [first, first + BURST_TIME * 2] {
+                later.newest[&one].0.send_replace(asked_again);
+                yield_now().await;
+            }
+            yield_now().await;
+            std::iter::from_fn(|| later.replies.try_join_next()).collect()
+        });
+        assert_eq!(given_up.len(), 1);
+        assert_eq!(given_up[0].as_ref().unwrap().meta.addr, one);
     }
 
     #[cfg(unix)]
