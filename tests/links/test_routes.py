@@ -883,6 +883,28 @@ def test_equal_reads_that_wait_are_answered_together(
     device.await_requests(requests)
 
 
+def test_reads_with_different_timeouts_are_not_answered_together(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    held = Held()
+    device.script = [held, silent]
+    units: dict[int | str, Any] = {1: {"route": "bus"}, 5: {"route": "drive"}}
+    devices = {"drive": {"url": device.url, "unit": 1, "timeout": 0.1}}
+    appliance = run(configuration(device.url, units=units, devices=devices))
+    first, hurried, patient = (connect(scada(appliance)) for _ in range(3))
+    first.send(wire.frame(SIXTH))
+    device.await_requests(1)
+    hurried.send(wire.frame(READ, unit=5))
+    await_count(appliance, "waiting", 2)
+    patient.send(wire.frame(READ))
+    await_count(appliance, "waiting", 3)
+    held.release()
+
+    assert hurried.receive().pdu == exception(READ, 0x0B)
+    assert patient.receive().pdu == FIVE
+    assert counters(appliance)["coalesced"] == 0
+
+
 def test_a_reply_answers_equal_reads_as_long_as_it_is_kept(
     device: Stream, run: Run, connect: Connect
 ) -> None:

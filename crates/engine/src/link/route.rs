@@ -311,6 +311,14 @@ impl Reply {
         }
     }
 
+    /// The longest time that the reply may take. Event loops wait as long as the most patient route of the link.
+    pub(super) fn longest_wait(&self) -> Duration {
+        match &self.to {
+            Receiver::Listener(_, timeout) => *timeout,
+            Receiver::EventLoop(to) => to.longest_wait,
+        }
+    }
+
     /// What is asked at the last moment before the request is sent. Event loops know by then that its turn
     /// has come.
     pub(super) fn wanted(&self) -> Option<Wanted> {

@@ -20,12 +20,15 @@ pub(in crate::link) struct SharedReads {
     coalesce: bool,
     /// How long a reply answers equal reads.
     keep: Duration,
-    waiting: RefCell<HashMap<ReadKey, Rc<EqualReads>>>,
+    /// By their timeouts too: none waits longer than its own.
+    waiting: RefCell<HashMap<WaitingKey, Rc<EqualReads>>>,
     cached: RefCell<HashMap<ReadKey, Cached>>,
 }
 
 /// A read that equal ones can share a reply with: its unit id and PDU.
 pub(in crate::link) type ReadKey = (u8, Box<[u8]>);
+
+type WaitingKey = (ReadKey, Duration);
 
 /// Equal reads. Each waits for a turn of its own, so that none waits longer than without the others; the
 /// first to have it is sent for all.
@@ -55,7 +58,7 @@ impl SharedReads {
 
     /// Lets a request wait with equal reads, if it is a read.
     pub(in crate::link) fn join(&self, read: Option<ReadKey>, reply: Reply) -> Joining<'_> {
-        let read = read.filter(|_| self.coalesce);
+        let read = read.filter(|_| self.coalesce).map(|read| (read, reply.longest_wait()));
         let equal = match &read {
             Some(read) => Rc::clone(self.waiting.borrow_mut().entry(read.clone()).or_default()),
             None => Rc::default(),
@@ -95,7 +98,7 @@ impl SharedReads {
 /// A request that waits for its turn.
 pub(in crate::link) struct Joining<'r> {
     reads: &'r SharedReads,
-    read: Option<ReadKey>,
+    read: Option<WaitingKey>,
     equal: Rc<EqualReads>,
     /// Whether an equal read waited before it.
     pub(in crate::link) follows_equal: bool,

@@ -216,10 +216,10 @@ impl ModbusUdp {
                     let ours = (Arc::clone(&self.unit_server), Arc::clone(context));
                     let reply =
                         asked.answered(pending, ours, Some(peer.into()), later.running.clone());
-                    let asked = Instant::now();
-                    let sent = Sent { asked, unit_id, request: request.to_vec(), times: 1 };
+                    let now = Instant::now();
+                    let sent = Sent { asked: now, unit_id, request: request.to_vec(), times: 1 };
                     later.sent.insert((peer, tag), sent);
-                    let pending = Completed { meta: *meta, asked, tag, unit_id, pdu: Vec::new() };
+                    let pending = Completed { meta: *meta, asked: now, tag, unit_id, pdu: Vec::new() };
                     later.begin(&asker, pending, D::HAS_IDS, reply);
                     0
                 }
