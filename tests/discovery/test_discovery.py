@@ -55,12 +55,16 @@ def device(present: Iterable[range], *, largest: int = 2000, too_large: int = 3)
     return answer
 
 
-def whole(present: Iterable[range], width: int, code: Outcome = OUTSIDE) -> Model:
-    """A device with these addresses, which only reads whole values of so many registers."""
+def whole(
+    present: Iterable[range], width: int, code: Outcome = OUTSIDE, *, first: int = 0
+) -> Model:
+    """A device with these addresses, which only reads whole values of so many registers. Values
+    begin at `first` and multiples of the width from there."""
     truth = device(present)
 
     def answer(probe: Probe) -> Outcome:
-        return code if probe.address % width or probe.count % width else truth(probe)
+        is_part = (probe.address - first) % width or probe.count % width
+        return code if is_part else truth(probe)
 
     return answer
 
@@ -408,6 +412,16 @@ def test_values_that_can_not_be_read_in_part_are_found(
     assert max(probe.address + probe.count for probe in probes) == span.stop
     assert found.largest <= (quantity or 125)
     assert (found.state, survey.at) == ("searched", survey.total)
+
+
+@pytest.mark.parametrize("exact", [False, True], ids=["samples", "exact"])
+@pytest.mark.parametrize("width", [2, 4])
+def test_values_at_odd_addresses_are_found_from_their_first(exact: bool, width: int) -> None:
+    layout = [range(1, 61), range(953, 1101), range(2997, 3101)]
+    survey = Survey(HR, exact=exact, span=range(4000))
+    carried_out(survey, whole(layout, width, first=1))
+    assert survey.areas[0].ranges == layout
+    assert [finding.addresses for finding in survey.findings] == layout
 
 
 def test_bits_are_only_read_alone_where_nothing_is_found() -> None:

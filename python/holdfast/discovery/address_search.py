@@ -534,8 +534,14 @@ class _Search:
         return None
 
     def _floor(self, address: int) -> int:
-        """The lowest address that can be in the same range as an existing address."""
+        """The lowest address that can be in the same range as an existing address.
+
+        Values of that range begin a multiple of the width apart: a refused read between two such
+        places does not show that an address is absent.
+        """
         at = bisect.bisect(self._places, address)
+        while at and (address - self._places[at - 1]) % self._width:
+            at -= 1
         return self._places[at - 1] + 1 if at else self._first
 
     def _follow(self, at: int, size: int) -> Steps[int]:
