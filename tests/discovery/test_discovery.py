@@ -115,7 +115,8 @@ def test_exact_finds_the_truth_with_few_reads(
     assert found.failures == {}
     holes = len(span) - sum(map(len, layout))
     limit = min(quantity, READ_LIMITS[area])
-    assert found.requests <= holes + follow_cost(layout, limit)
+    value_reads = 2 * 2 * len(address_search.sample_places(span))
+    assert found.requests <= holes + (follow_cost(layout, limit) if layout else value_reads)
 
 
 @given(
@@ -422,6 +423,14 @@ def test_values_at_odd_addresses_are_found_from_their_first(exact: bool, width: 
     carried_out(survey, whole(layout, width, first=1))
     assert survey.areas[0].ranges == layout
     assert [finding.addresses for finding in survey.findings] == layout
+
+
+@pytest.mark.parametrize("width", [2, 4])
+@pytest.mark.parametrize("first", [51, 2999])
+def test_exact_finds_values_away_from_usual_starts(first: int, width: int) -> None:
+    layout = [range(first, first + 40)]
+    model = whole(layout, width, first=first)
+    assert mapped(model, exact=True, span=range(4000)).ranges == layout
 
 
 def test_bits_are_only_read_alone_where_nothing_is_found() -> None:

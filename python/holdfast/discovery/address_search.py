@@ -15,8 +15,9 @@ registers, and then coils and discrete inputs in the same way.
 If a block fails, but all its parts can be read, it was too large: blocks then stay smaller.
 
 Some devices refuse to read a part of a value. If no register of an area can be read alone, two and
-then four registers are read at some places. If such a read succeeds, the area is searched again in
-reads of that size; an address is then absent if the read that begins there returns exception 02.
+then four registers are read at some places; the exact search reads them at all samples, and at the
+addresses after those. If such a read succeeds, the area is searched again in reads of that size; an
+address is then absent if the read that begins there returns exception 02.
 """
 
 from __future__ import annotations
@@ -311,8 +312,13 @@ class Survey:
         """The reads that show whether an area has values that can't be read in part."""
         if area in BIT_AREAS:
             return []
-        first = self.span if self.exact else self.samples
-        places = dict.fromkeys((*self.starts, *first[:FIRST_ADDRESSES:2]))
+        if self.exact:
+            # Values can begin at odd addresses, and most samples are even.
+            samples = sample_places(self.span)
+            more = [*samples, *(each + 1 for each in samples)]
+        else:
+            more = self.samples[:FIRST_ADDRESSES:2]
+        places = dict.fromkeys((*self.starts, *more))
         return [
             Probe(area, place, width)
             for width in VALUE_WIDTHS
