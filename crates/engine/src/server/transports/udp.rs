@@ -219,7 +219,8 @@ impl ModbusUdp {
                     let now = Instant::now();
                     let sent = Sent { asked: now, unit_id, request: request.to_vec(), times: 1 };
                     later.sent.insert((peer, tag), sent);
-                    let pending = Completed { meta: *meta, asked: now, tag, unit_id, pdu: Vec::new() };
+                    let pending =
+                        Completed { meta: *meta, asked: now, tag, unit_id, pdu: Vec::new() };
                     later.begin(&asker, pending, D::HAS_IDS, reply);
                     0
                 }
