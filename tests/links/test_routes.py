@@ -17,7 +17,7 @@ from support.audits import await_writes
 from support.fake_device import FakeDevice, Serial, Stream, Udp, exception, good, silent
 from support.lines import ASCII, RTU, Line, Mode
 from support.routed import Held, await_count, configuration, counters
-from support.running import endpoint
+from support.running import endpoint, log_events
 from support.transports import TRANSPORTS, Client, Datagrams, FramedConnection, client
 
 if TYPE_CHECKING:
@@ -211,22 +211,48 @@ READ_AND_WRITE = READ + bytes.fromhex("0000 01 0600011234 0000")
     "rule", [{"access": "read-only"}, {"functions": [3, 6, 8, 16]}], ids=["read-only", "functions"]
 )
 def test_what_a_line_could_take_for_several_requests_is_not_sent(
-    rule: dict[str, Any], kind: str, run: Run, connect: Connect, tmp_path: Path
+    rule: dict[str, Any],
+    kind: str,
+    run: Run,
+    connect: Connect,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Also over TCP: a gateway may be in between."""
     echo_and_write = bytes.fromhex("08 0000 a537 0000 01 0600011234 0000")
     with Stream(kind) as device:
         text = configuration(device.url, rule=rule, audit={"file": "audit.log"})
-        front = connect(scada(run(text)))
+        appliance = run(text)
+        front = connect(scada(appliance))
         for request in (READ_AND_WRITE, echo_and_write, READ[:-1]):
             assert front.ask(request) == exception(request, 3)
         if "functions" in rule:
-            for request in (WRITE[:-1], WRITE + b"\0", bytes.fromhex("100001000102")):
+            longer = [WRITE + bytes(count) for count in (1, 3, 4)]
+            for request in (WRITE[:-1], *longer, bytes.fromhex("100001000102")):
                 assert front.ask(request) == exception(request, 3)
         assert front.ask(READ) == FIVE
         assert [asked.pdu for asked in device.requests] == [READ]
         [line, *_] = await_writes(tmp_path / "audit.log", 1)
     assert (line["function"], line["outcome"]) == (3, "illegal_data_value")
+    log_events(appliance)
+    [refused] = [
+        vars(each)["fields"] for each in caplog.records if each.message == "refused_function"
+    ]
+    assert (refused["unit"], refused["function"]) == (1, 3)
+
+
+@pytest.mark.parametrize("request_", ["06 0005 00012345", "08 0000 a537 a538", "03 0005 0001 0000"])
+def test_two_bytes_more_pass_unless_the_rule_is_read_only(
+    request_: str, unmodelled: FakeDevice, run: Run, connect: Connect
+) -> None:
+    """Some devices have such requests, as a write of 32 bits. No other request fits into them."""
+    request = bytes.fromhex(request_)
+    connect(scada(run(configuration(unmodelled.url)))).ask(request)
+    assert unmodelled.asked == [request]
+
+    read_only = run(configuration(unmodelled.url, rule={"access": "read-only"}))
+    assert connect(scada(read_only)).ask(request) == exception(request, 1)
+    assert unmodelled.asked == [request]
 
 
 def test_a_route_to_a_device_sends_its_unit_id_and_a_link_keeps_that_of_the_request(

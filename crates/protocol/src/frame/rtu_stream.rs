@@ -229,6 +229,24 @@ pub fn is_one_request(pdu: &[u8]) -> bool {
     }
 }
 
+/// Whether a server on a serial line finds no other request in this PDU, though it may be longer than its
+/// function requires: some devices take two bytes more, as function 6 with a value of 32 bits has, and
+/// function 8 with two words. For all others these bytes can only be the CRC. The CRC of the frame is then
+/// 0, and no request begins with that. The length of other functions is unknown: returns true.
+///
+/// ```
+/// use holdfast_protocol::frame::rtu_stream::hides_no_request;
+///
+/// assert!(hides_no_request(&[6, 0, 5, 0, 1, 0xE2, 0x40]));
+/// assert!(!hides_no_request(&[6, 0, 5, 0, 1, 0xE2, 0x40, 1]));
+/// assert!(!hides_no_request(&[3, 0, 5, 0, 1, 0x94, 0x0B, 1, 6, 0, 5, 0xBE, 0xEF]));
+/// assert!(!hides_no_request(&[6, 0, 5, 0]));
+/// ```
+pub fn hides_no_request(pdu: &[u8]) -> bool {
+    is_one_request(pdu)
+        || pdu.len().checked_sub(2).is_some_and(|shorter| is_one_request(&pdu[..shorter]))
+}
+
 /// Returns the length of the data between function code and CRC (V1.1b3, 6).
 fn request_data_len(function_code: u8, data: &[u8]) -> DataLen {
     let counted = |at: usize| {

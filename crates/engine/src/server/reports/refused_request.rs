@@ -78,6 +78,10 @@ impl RefusedRequest {
             ExceptionCode::ServerDeviceBusy if place.memory().is_some_and(Memory::sealed) => {
                 Some(RefusedRequest::new(unit_id, request, Why::Sealed))
             }
+            // Devices on a line could find another request in it, with a function that the peer may not use.
+            ExceptionCode::IllegalDataValue if matches!(place, Elsewhere::Device(_)) => {
+                Some(RefusedRequest::new(unit_id, request, Why::Function))
+            }
             code => RefusedRequest::from_exception(unit_id, request, code),
         }
     }

@@ -11,7 +11,7 @@
 use std::sync::Arc;
 
 use holdfast_memory::{Access, Area, Memory, Read, Write};
-use holdfast_protocol::frame::rtu_stream::is_one_request;
+use holdfast_protocol::frame::rtu_stream::hides_no_request;
 use holdfast_protocol::pdu::{
     self, Buffer, Diagnostics, ExceptionCode, Function, Range, Request, SubFunction, reply,
 };
@@ -199,7 +199,7 @@ impl UnitServer {
             _ if !rights.allows(unit_id, function_code) => Err(NOT_ALLOWED),
             // A gateway may put it on a line, whose devices could read it as several requests: with
             // functions, and for units, that the peer may not use.
-            Elsewhere::Device(_) if !is_one_request(request) => {
+            Elsewhere::Device(_) if !hides_no_request(request) => {
                 Err(ExceptionCode::IllegalDataValue)
             }
             Elsewhere::Device(_) if rights.denies(unit_id, request) => Err(NOT_ALLOWED),
