@@ -174,6 +174,27 @@ def test_a_list_of_an_authority_of_the_same_name_is_doubtful(
     assert reasons(appliance, caplog) == ["unknown_revocation"]
 
 
+def test_a_list_can_revoke_a_client_that_is_listed_without_its_authority(
+    plant: Plant, run: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    files = {"ca_file": plant.client.certificate, "crl_file": plant.authority.revoke()}
+    assert plant.warnings(**files) == []
+    assert verdict(run(plant.config(**files).read_text()), plant.trust()) == "served"
+
+    files["crl_file"] = plant.authority.revoke(plant.client)
+    appliance = run(plant.config(**files).read_text())
+    assert "REVOKED" in verdict(appliance, plant.trust())
+    assert reasons(appliance, caplog) == ["revoked"]
+
+
+def test_a_client_that_is_listed_with_its_authority_is_doubtful(plant: Plant) -> None:
+    whole = plant.joined("whole.pem", plant.client.certificate, plant.authority.ca)
+    assert plant.warnings(ca_file=whole) == [
+        "certificate 1 (CN=client) is of the authority in certificate 2: all clients of that "
+        "authority are trusted, not only this one"
+    ]
+
+
 def test_certificates_in_the_wrong_order_are_an_error(plant: Plant, mint: Mint) -> None:
     root = mint.root()
     between = mint.make(by=root, name="between", extensions=(CA, SIGNS))

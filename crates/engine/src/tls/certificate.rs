@@ -1,7 +1,7 @@
 //! Reads the properties of an X.509 certificate that trust and roles depend on.
 
 use rustls::pki_types::{CertificateDer, UnixTime};
-use rustls::{CertificateError, DistinguishedName, ExtendedKeyPurpose};
+use rustls::{CertificateError, ExtendedKeyPurpose};
 use webpki::KeyPurposeId;
 use x509_cert::certificate::{CertificateInner, Profile};
 use x509_cert::der::asn1::{AnyRef, ObjectIdentifier, UintRef, Utf8StringRef};
@@ -247,6 +247,10 @@ impl Parsed {
         self.0.tbs_certificate().subject() == name
     }
 
+    pub(super) fn has_issuer(&self, name: &Name) -> bool {
+        self.0.tbs_certificate().issuer() == name
+    }
+
     /// The subject for a log, as RFC 4514 writes it. Control characters are replaced.
     pub(super) fn subject_text(&self) -> String {
         name_text(self.0.tbs_certificate().subject())
@@ -281,9 +285,12 @@ impl Parsed {
         found.map(|found| found.map(|(_, points)| points))
     }
 
-    /// The subject, for the list of accepted issuers that a server sends to clients.
-    pub(super) fn subject(&self) -> Option<DistinguishedName> {
-        self.0.tbs_certificate().subject().to_der().ok().map(DistinguishedName::from)
+    /// The issuer by which a client finds that a server that lists this certificate accepts its own: an
+    /// authority itself, and the issuer of any other certificate. A distinguished name as DER.
+    pub(super) fn accepted_issuer(&self) -> Option<Vec<u8>> {
+        let certificate = self.0.tbs_certificate();
+        let name = if self.is_authority() { certificate.subject() } else { certificate.issuer() };
+        name.to_der().ok()
     }
 }
 

@@ -1,5 +1,6 @@
 //! Verifies the certificates of clients, for a server.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use rustls::pki_types::{CertificateDer, UnixTime};
@@ -20,7 +21,7 @@ use super::verification::{Listed, Trust};
 #[derive(Debug)]
 pub(super) struct Clients {
     trust: Trust,
-    subjects: Vec<DistinguishedName>,
+    accepted_issuers: Vec<DistinguishedName>,
     /// The allowed roles; `None` is any.
     roles: Option<Vec<String>>,
 }
@@ -36,11 +37,17 @@ impl Clients {
             return may_lack_authorities(files).map(|()| None);
         };
         let listed = Listed::of_file(ca_file)?;
-        let subjects = listed.iter().filter_map(|each| each.parsed.subject()).collect();
+        let names: BTreeSet<_> =
+            listed.iter().filter_map(|each| each.parsed.accepted_issuer()).collect();
+        let accepted_issuers = names.into_iter().map(DistinguishedName::from).collect();
         doubts.of_listed(ca_file, &listed);
+        let may_have_list = |each: &Listed| each.is_authority() || !each.parsed.is_self_signed();
         let lists = match &files.crl_file {
-            Some(file) if !listed.iter().any(Listed::is_authority) => {
-                let flaw = format!("crl_file requires an authority (CA:TRUE) in {ca_key}");
+            Some(file) if !listed.iter().any(may_have_list) => {
+                let flaw = format!(
+                    "crl_file requires an authority (CA:TRUE) in {ca_key}, or a certificate that \
+                     one has signed"
+                );
                 return Err(FileError::content(file, flaw));
             }
             Some(file) => {
@@ -51,7 +58,7 @@ impl Clients {
             None => Vec::new(),
         };
         let trust = Trust::new(listed, Lists { lists, expired: files.expired_lists });
-        Ok(Some(Clients { trust, subjects, roles: files.roles.clone() }))
+        Ok(Some(Clients { trust, accepted_issuers, roles: files.roles.clone() }))
     }
 
     /// Verifies the certificate of a client, its own first, and its role.
@@ -91,7 +98,7 @@ fn may_lack_authorities(files: &ServerFiles) -> Result<(), FileError> {
 
 impl ClientCertVerifier for Clients {
     fn root_hint_subjects(&self) -> &[DistinguishedName] {
-        &self.subjects
+        &self.accepted_issuers
     }
 
     fn verify_client_cert(
@@ -140,4 +147,32 @@ fn refused(failure: &TlsFailure) -> Error {
         other => return CertificateError::Other(OtherError(Arc::new(other.clone()))).into(),
     };
     error.into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tls::test_party::{Owner, Party};
+
+    #[test]
+    fn clients_find_the_issuer_of_a_listed_certificate_among_the_accepted_ones() {
+        let party = Party::new();
+        let (other, alone) = (Owner::authority("other", None), Owner::new("alone", None, |_| {}));
+        let issuers = |listed: &[&Owner]| -> Vec<Vec<u8>> {
+            let text: String = listed.iter().map(|owner| owner.pem()).collect();
+            let files = ServerFiles {
+                ca_file: Some(party.folder.write("listed.pem", &text)),
+                ..party.files()
+            };
+            let clients = Clients::load(&files, &mut Doubts::new(&files, UnixTime::now()));
+            let clients = clients.unwrap().unwrap();
+            clients.root_hint_subjects().iter().map(|name| name.as_ref().to_vec()).collect()
+        };
+        let authority = issuers(&[&party.authority]);
+        assert_eq!(authority.len(), 1);
+        assert_eq!(issuers(&[&party.client, &party.server]), authority);
+        assert_eq!(issuers(&[&party.client, &other]).len(), 2);
+        assert_ne!(issuers(&[&alone]), authority);
+        assert_eq!(issuers(&[&alone]).len(), 1);
+    }
 }

@@ -44,6 +44,17 @@ impl<'f> Doubts<'f> {
                 false => "this client is refused",
             };
             self.of_dates(file, parsed, number, outcome);
+            let mut others = listed.iter().zip(1..).filter(|(other, _)| other.is_authority());
+            if !each.is_authority()
+                && let Some((_, issuer)) =
+                    others.find(|(other, _)| parsed.is_issued_by(&other.parsed))
+            {
+                let name = parsed.subject_text();
+                self.add(file, &format!(
+                    "certificate {number} ({name}) is of the authority in certificate {issuer}: all \
+                     clients of that authority are trusted, not only this one"
+                ));
+            }
         }
     }
 
@@ -75,12 +86,17 @@ impl<'f> Doubts<'f> {
                 let issued = |each: &&(&Listed, usize)| each.0.parsed.has_subject(list.issuer());
                 authorities.iter().filter(issued)
             };
-            if named().next().is_none() {
+            // A client can be listed without its authority.
+            let is_of_client =
+                |each: &Listed| !each.is_authority() && each.parsed.has_issuer(list.issuer());
+            let is_named = named().next().is_some();
+            if !is_named && !listed.iter().any(is_of_client) {
                 self.add(file, &format!(
                     "{name} is not of an authority in {ca_key}: it applies only to clients that \
                      send its authority"
                 ));
-            } else if !named().any(|(each, _)| list.is_signed_by(&each.parsed)) {
+            }
+            if is_named && !named().any(|(each, _)| list.is_signed_by(&each.parsed)) {
                 self.add(file, &format!(
                     "{name} is not signed by the authority of that name in {ca_key}: clients of \
                      that authority are refused"

@@ -199,7 +199,8 @@ impl Lists {
         self.check_certificate(end_entity, list, presented.as_ref(), listed, now)
     }
 
-    /// Judges a listed certificate, which needs no list: the operator vouches for it.
+    /// Judges a listed certificate, which needs no list: the operator vouches for it. A list that
+    /// `is_signed` by its authority comes first. No signature can be checked if the authority is not listed.
     ///
     /// # Errors
     /// It is revoked.
@@ -207,8 +208,11 @@ impl Lists {
         &self,
         certificate: &Cert<'_>,
         parsed: &Parsed,
+        is_signed: impl Fn(&List) -> bool,
     ) -> Result<(), webpki::Error> {
-        let list = self.find_list(certificate, parsed, !parsed.has_ca_flag());
+        let is_for = |list: &&List| list.is_for(certificate, parsed, !parsed.has_ca_flag());
+        let lists = || self.lists.iter().filter(is_for);
+        let list = lists().find(|list| is_signed(list)).or_else(|| lists().next());
         list.map_or(Ok(()), |list| list.check(certificate))
     }
 
@@ -353,10 +357,14 @@ mod tests {
 
     /// The reason why a client is not trusted; empty if it is.
     fn judged(listed: &Owner, lists: &[Vec<u8>], chain: &[&Owner]) -> &'static str {
+        judged_by(&[listed], lists, chain)
+    }
+
+    fn judged_by(listed: &[&Owner], lists: &[Vec<u8>], chain: &[&Owner]) -> &'static str {
         let lists = lists.iter().map(|der| List::new(der, 1).unwrap()).collect();
-        let listed = Listed::new(listed.certificate.der().clone()).unwrap();
+        let listed = listed.iter().map(|owner| Listed::new(owner.certificate.der().clone()));
         let lists = Lists { lists, expired: ExpiredLists::Refuse };
-        let trust = Trust::new(Arc::new([listed]), lists);
+        let trust = Trust::new(listed.collect::<Result<_, _>>().unwrap(), lists);
         let ders: Vec<_> = chain.iter().map(|owner| owner.certificate.der().clone()).collect();
         match trust.judge(&ders[0], &ders[1..], Purpose::Client, NOW) {
             Ok(()) => "",
@@ -433,6 +441,19 @@ mod tests {
         assert_eq!(reason(&[version_1(&other, &[&leaf])]), "");
         assert_eq!(reason(&[version_1(&root, &[])]), "");
         assert_eq!(reason(&[version_1(&root, &[&leaf])]), "revoked");
+    }
+
+    #[test]
+    fn a_listed_certificate_is_judged_by_the_list_that_its_listed_authority_has_signed() {
+        let (root, twin) = (Owner::authority("root", None), Owner::authority("root", None));
+        let leaf = Owner::new("leaf", Some(&root), numbered(4));
+        let reason = |lists: &[Vec<u8>]| judged_by(&[&leaf, &root], lists, &[&leaf]);
+        let revokes = |by| version_1(by, &[&leaf]);
+        let revokes_none = |by| version_1(by, &[]);
+        assert_eq!(reason(&[revokes(&twin), revokes_none(&root)]), "");
+        assert_eq!(reason(&[revokes_none(&twin), revokes(&root)]), "revoked");
+        // Nobody knows whose list it is: a client that may be revoked is refused.
+        assert_eq!(reason(&[revokes(&twin)]), "revoked");
     }
 
     #[test]

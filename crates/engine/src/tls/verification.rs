@@ -23,7 +23,7 @@ use super::certificate::{Parsed, Purpose};
 use super::failure::{TlsFailure, between};
 use super::files::{FileError, certificates};
 use super::provider::ALGORITHMS;
-use super::revocation::Lists;
+use super::revocation::{List, Lists};
 
 /// A trusted certificate.
 #[derive(Debug)]
@@ -110,7 +110,15 @@ impl Trust {
         parsed.is_valid_at(now)?;
         parsed.is_for(purpose)?;
         if self.listed.iter().any(|listed| listed.certificate == *presented) {
-            return self.lists.judge_listed(&end_entity, &parsed).map_err(refused);
+            let is_signed = |list: &List| {
+                let signs = |each: &Listed| {
+                    each.is_authority()
+                        && parsed.is_issued_by(&each.parsed)
+                        && list.is_signed_by(&each.parsed)
+                };
+                self.listed.iter().any(signs)
+            };
+            return self.lists.judge_listed(&end_entity, &parsed, is_signed).map_err(refused);
         }
         // An authority is not a device: its own certificate must be listed to be accepted as one.
         if parsed.has_ca_flag() {
