@@ -391,6 +391,22 @@ def test_who_silences_a_unit_is_logged_and_a_reload_ends_it(
     ]
 
 
+def test_each_unit_that_a_peer_silences_is_logged(
+    run: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    units = list(range(1, 101))
+    rules = [{**rule(["127.0.0.1"]), "units": {"1-100": "plant"}}]
+    appliance = run(configuration("tcp", rules=rules, listen_only=True))
+    with client("tcp", address(appliance)) as peer:
+        for unit in units:
+            peer.send(TRANSPORTS["tcp"].frame(bytes.fromhex("0800040000"), unit))
+        assert peer.ask(READ, 101) == b"\x83\x0b"
+
+    log_events(appliance)
+    found = [vars(each)["fields"] for each in caplog.records if each.message == "unit_silenced"]
+    assert [fields["unit"] for fields in found] == units
+
+
 # What the log has of refused requests
 
 

@@ -41,8 +41,13 @@ LEVELS = {
 
 LIMITED_INFOS = ("secured", "unit_back")
 
-# Events whose number is limited for each role.
-BY_ROLE = ("secured", "refused_role")
+# Events whose number is limited for each value of this field, and not for each reason.
+LIMITED_BY = {
+    "secured": "role",
+    "refused_role": "role",
+    "unit_silenced": "unit",
+    "unit_back": "unit",
+}
 
 # The fields of a connection that was ended, in the audit log.
 _AUDITED = ("peer", "role", "subject", "serial")
@@ -201,5 +206,5 @@ def _log_event(listener: str, event: str, found: Mapping[str, object]) -> None:
         log_lines.write(LEVELS[event], event, **fields)
     else:
         level = logging.INFO if event in LIMITED_INFOS else logging.WARNING
-        about = found.get("role" if event in BY_ROLE else "reason")
+        about = found.get(LIMITED_BY.get(event, "reason"))
         log_lines.count(level, event, fields, kind=(listener, about), times=times)

@@ -85,7 +85,14 @@ impl Kind {
 
     /// Whether repetitions by a noisy source may be counted instead of sent.
     const fn is_refusal(self) -> bool {
-        let is_change = matches!(self, Kind::RightsRevoked | Kind::LineLost | Kind::LineBack);
+        let is_change = matches!(
+            self,
+            Kind::RightsRevoked
+                | Kind::LineLost
+                | Kind::LineBack
+                | Kind::UnitSilenced(_)
+                | Kind::UnitBack(_)
+        );
         !self.is_ordinary() && !is_change && !matches!(self, Kind::Secured)
     }
 
@@ -425,6 +432,21 @@ mod tests {
         let counts: Vec<u64> =
             all[MAX_EVENTS_OF_SOURCE..].iter().map(|event| event.count).collect();
         assert_eq!(counts, [2; 12]);
+    }
+
+    #[test]
+    fn changes_of_a_unit_keep_their_order() {
+        let (reporter, events) = channel(Verbosity::Refusals);
+        let changes: Vec<Kind> =
+            std::iter::repeat_n([Kind::UnitSilenced(5), Kind::UnitBack(5)], 40)
+                .flatten()
+                .chain([Kind::UnitSilenced(5)])
+                .collect();
+        for kind in &changes {
+            refuse(&reporter, "10.0.0.9", 1, *kind);
+        }
+        let found = std::iter::from_fn(|| events.next(Duration::ZERO));
+        assert_eq!(found.map(|event| event.kind).collect::<Vec<_>>(), changes);
     }
 
     #[test]

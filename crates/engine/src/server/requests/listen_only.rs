@@ -21,11 +21,16 @@ impl ListenOnly {
 
     /// Returns the units whose mode this has ended: after a reload, perhaps no peer has the right to.
     pub(crate) fn set_allowed(&self, is_allowed: bool) -> Vec<u8> {
+        let was_allowed = self.is_allowed.load(Ordering::Relaxed);
+        if is_allowed && was_allowed {
+            return Vec::new();
+        }
+        self.is_allowed.store(false, Ordering::Relaxed);
+        // Also before it is allowed again: a request may have set a unit to it just after it was forbidden.
+        let ends = |unit_id: &u8| self.units[usize::from(*unit_id)].swap(false, Ordering::Relaxed);
+        let ended = (0..=u8::MAX).filter(ends).collect();
         self.is_allowed.store(is_allowed, Ordering::Relaxed);
-        let ends = |unit_id: &u8| {
-            !is_allowed && self.units[usize::from(*unit_id)].swap(false, Ordering::Relaxed)
-        };
-        (0..=u8::MAX).filter(ends).collect()
+        ended
     }
 
     /// Whether a request would set a unit to listen only mode, and the listener does not allow that.
@@ -66,4 +71,22 @@ impl ListenOnly {
 fn asks_for(request: &[u8], sub_function: SubFunction) -> bool {
     request.first() == Some(&Function::Diagnostics.code())
         && SubFunction::from_pdu(request) == Some(sub_function)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_unit_that_was_set_to_it_too_late_answers_when_it_is_allowed_again() {
+        let listen_only = ListenOnly::new(true);
+        listen_only.begin(1);
+        assert_eq!(listen_only.set_allowed(true), []);
+        assert!(listen_only.is_on(1));
+        assert_eq!(listen_only.set_allowed(false), [1]);
+        // A request that was let pass before.
+        listen_only.begin(2);
+        assert_eq!(listen_only.set_allowed(true), [2]);
+        assert!(!listen_only.is_on(2));
+    }
 }
