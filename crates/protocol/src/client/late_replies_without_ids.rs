@@ -12,7 +12,8 @@ use super::raised_timeouts::Lateness;
 use super::tolerance::{AcceptUnit, Tolerance};
 use crate::pdu::{EncodedRequest, Request};
 
-/// Requests without a reply that are remembered. With the bounds on their time, there are never as many.
+/// Requests without a reply that are remembered. With the bounds on their time, there are never as many, except
+/// for broadcasts.
 const MAX_UNANSWERED_REQUESTS: usize = 64;
 
 /// A late reply may take this many times the timeout, as long as nothing else is known.
@@ -297,10 +298,16 @@ impl LateReplies {
             self.never_came.extend(request.pdu().first().map(|function| (unit_id, *function)));
             return;
         }
-        if self.unanswered.len() == MAX_UNANSWERED_REQUESTS {
-            self.unanswered.pop_front();
+        let is_broadcast = how == Ended::Broadcast;
+        if is_broadcast {
+            let same = confirmation(request);
+            self.unanswered.retain(|old| !old.is_broadcast || confirmation(&old.request) != same);
         }
-        let (request, is_broadcast) = (request.clone(), how == Ended::Broadcast);
+        if self.unanswered.len() == MAX_UNANSWERED_REQUESTS {
+            let oldest = self.unanswered.iter().position(|old| old.is_broadcast);
+            self.unanswered.remove(oldest.unwrap_or_default());
+        }
+        let request = request.clone();
         let from = Time::ZERO;
         self.unanswered.push_back(Unanswered { unit_id, request, is_broadcast, sent, until, from });
     }
