@@ -339,6 +339,12 @@ impl Later {
         }
     }
 
+    /// Whether a peer has asked again, after a pause.
+    fn has_asked_again(&self, peer: SocketAddr, asked: Instant) -> bool {
+        let newest = self.newest.get(&peer).map(|(newest, _)| *newest.borrow());
+        newest.is_some_and(|newest| newest.duration_since(asked) > BURST_TIME)
+    }
+
     /// A peer waits for one reply less.
     fn end(&mut self, peer: SocketAddr) {
         if let Entry::Occupied(mut client) = self.clients.entry(peer.ip()) {
@@ -369,9 +375,11 @@ struct Completed {
 /// Sends the reply of a device.
 fn complete<D: Datagram>(socket: &Datagrams, completed: Completed, later: &mut Later) {
     let Completed { meta, asked, tag, unit_id, pdu } = completed;
+    // It may have asked again just when the reply came.
+    let is_late = !D::HAS_IDS && later.has_asked_again(meta.addr, asked);
     later.end(meta.addr);
     let times = later.times(meta.addr, tag, asked);
-    if !pdu.is_empty() {
+    if !pdu.is_empty() && !is_late {
         let mut frame = [0; MAX_FRAME_LEN];
         frame[D::HEADER_LEN..][..pdu.len()].copy_from_slice(&pdu);
         let len = D::complete(&mut frame, tag, unit_id, pdu.len());
