@@ -558,8 +558,9 @@ impl Device {
             if retried.as_ref().is_some_and(|retried| retried.is(range)) {
                 match self.ask(&block).await {
                     Err(fault) => found = fault,
-                    Ok(_) => {
-                        // The next poll reads it.
+                    Ok(bytes) => {
+                        // The next poll reads it with others.
+                        gathered.note(&block, Ok(bytes));
                         *self.learned() = Learned::default();
                         self.draw_plan();
                         continue;

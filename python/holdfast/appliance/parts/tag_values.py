@@ -277,7 +277,9 @@ class TagValues:
         """Takes and converts polls until a time, at least one."""
         while found:
             name, start, blocks = found.popleft()
-            if name in self._readers and start >= self._since.get(name, 0.0):
+            # That a device stands by is reported once: it may have begun before the reload ended.
+            is_new = not blocks or start >= self._since.get(name, 0.0)
+            if name in self._readers and is_new:
                 yield self._readers[name].poll(blocks)
             if time.monotonic() >= until:
                 return
