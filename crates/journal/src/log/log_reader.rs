@@ -216,8 +216,8 @@ async fn read_from(
     Ok(Reading { state, messages })
 }
 
-/// The digest that the log leads to at a sequence, from the oldest snapshot: the fewer nodes have made
-/// what this begins with, the better.
+/// The digest that the log leads to at a sequence, from the oldest snapshot that the stream goes on
+/// behind: the fewer nodes have made what this begins with, the better.
 pub(super) async fn digest_at(
     store: &Store,
     pointer: &Pointer,
@@ -225,7 +225,9 @@ pub(super) async fn digest_at(
     sequence: u64,
 ) -> Result<String, String> {
     let until = Until::Sequence(sequence);
-    let known = [pointer.previous.as_ref(), Some(&pointer.newest)];
+    let info = store.stream.get_info().await.map_err(|error| error.to_string())?;
+    let is_continued = |snapshot: &&Snapshot| snapshot.sequence + 1 >= info.state.first_sequence;
+    let known = [pointer.previous.as_ref().filter(is_continued), Some(&pointer.newest)];
     let mut reading = read_from(store, known, members, until).await.map_err(End::reason)?;
     while reading.state.place.sequence < sequence {
         reading.next(until).await.map_err(End::reason)?;

@@ -93,9 +93,10 @@ class Folder:
         """Writes the server's configuration. Returns its file."""
         file = self.path / "nats-server.conf"
         try:
-            self._limit = self._possible_limit()
-            settings = json.dumps(self._settings(access), indent=2, ensure_ascii=False)
+            limit = self._possible_limit()
+            settings = json.dumps(self._settings(access, limit), indent=2, ensure_ascii=False)
             replace(file, f"{settings}\n".encode(), SECRET)
+            self._limit = limit
         except OSError as error:
             raise _unusable(error.filename or file, error) from error
         return file
@@ -137,7 +138,7 @@ class Folder:
                 os.kill(left, signal.SIGTERM)
             time.sleep(0.05)
 
-    def _settings(self, access: Access) -> dict[str, Any]:
+    def _settings(self, access: Access, limit: int) -> dict[str, Any]:
         return {
             "server_name": "holdfast",
             "host": access.host,
@@ -146,7 +147,7 @@ class Folder:
             "jetstream": {
                 "store_dir": str(self.path / "store"),
                 "sync_interval": "always",
-                "max_file_store": self._limit,
+                "max_file_store": limit,
             },
             "authorization": self._authorization(access),
         }
