@@ -78,10 +78,11 @@ class Subscriptions:
         # One that was changed is new: its values go elsewhere.
         known = granted if before == self._meaning(entry) else None
         if self._is_version_5:
-            has_had = known is not None or (before is None and self._is_restored(entry))
+            # With QoS 0, the broker keeps nothing for the session of a process that has ended.
+            is_kept = before is None and entry.qos > 0 and self._is_restored(entry)
             retained = (
                 SubscribeOptions.RETAIN_SEND_IF_NEW_SUB
-                if has_had
+                if known is not None or is_kept
                 else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
             )
             options = SubscribeOptions(qos=entry.qos, retainHandling=retained)

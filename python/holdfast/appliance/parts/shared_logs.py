@@ -127,7 +127,8 @@ class SharedLogs(Part):
         except ValueError as error:
             raise LogNotJoined(f"logs.{name}: {error}", is_permanent=True) from None
         sequence, names = log.status()["sequence"], [each for each, _ in members]
-        if sequence > 1:  # The first message is that this node has joined.
+        # The first message is that this node has joined. Nobody else writes an embedded log.
+        if sequence > 1 and settings.embedded is None:
             self.restored.update(names)
         log_lines.write(
             logging.INFO,
