@@ -12,7 +12,7 @@ from holdfast.server.options import STREAM_DEFAULTS
 poller = _core.Poller([])
 url, in_flight, reads = sys.argv[1:]
 coalesce = reads == "together"
-link = poller.link("device", endpoint(parse(url)), in_flight=int(in_flight), coalesce=coalesce)
+link = poller.link(endpoint(parse(url)), in_flight=int(in_flight), coalesce=coalesce)
 rule = _core.Rule(
     {1: link.route("device", timeout=1.0)}, sources=["127.0.0.1"], access="read-write"
 )
