@@ -188,3 +188,26 @@ def test_a_broadcast_without_a_connection_is_not_sent() -> None:
     request = _core.Request.write_register(0, 1)
     with pytest.raises(holdfast.RequestTimeout, match="no connection"):
         asyncio.run(send(cast("Any", Unconnected()), request, 1.0))
+
+
+@pytest.mark.parametrize(
+    "outcomes",
+    [
+        [holdfast.RequestTimeout("no connection", maybe_sent=False), holdfast.RequestTimeout()],
+        [holdfast.InvalidResponse("unit id 7", "unit_id")],
+    ],
+    ids=["over a slow connection", "confirmed"],
+)
+def test_a_broadcast_is_sent(outcomes: list[Exception]) -> None:
+    waits = []
+
+    class Slow:
+        async def call(self, _request: _core.Request, _unit: int, timeout: float) -> None:
+            waits.append(timeout)
+            raise outcomes[len(waits) - 1]
+
+        async def close(self) -> None:
+            pass
+
+    asyncio.run(send(cast("Any", Slow()), _core.Request.write_register(0, 1), 5.0))
+    assert waits == [0.5, 4.0][: len(outcomes)]
