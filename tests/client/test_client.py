@@ -1032,6 +1032,31 @@ def test_a_call_that_is_cancelled_while_it_connects_sends_nothing() -> None:
     run(main)
 
 
+def test_a_dead_connection_is_replaced_although_each_call_has_a_limit_of_its_own() -> None:
+    """The limit is shorter than the timeout, as that of `asyncio.timeout` may be."""
+    first: list[Any] = []
+
+    def answers_on_another_one(asked: Asked) -> None:
+        if asked.peer is not first[0]:
+            asked.answer()
+
+    async def main(url: str) -> None:
+        async with holdfast.Client(url, timeout=0.2) as plc, asyncio.timeout(wire.DEADLINE):
+            while True:
+                try:
+                    async with asyncio.timeout(0.1):
+                        await plc.read_holding_registers(0, 1)
+                    break
+                except TimeoutError:
+                    continue
+
+    with Stream(
+        "tcp", then=answers_on_another_one, greet=lambda peer, _: first.append(peer)
+    ) as device:
+        asyncio.run(main(device.url))
+        assert device.connections == 2
+
+
 def test_the_only_call_may_be_cancelled_while_it_connects() -> None:
     async def main() -> None:
         with Stream("tcp") as device:

@@ -332,6 +332,39 @@ fn a_silent_connection_ends_after_three_timeouts() {
 }
 
 #[test]
+fn a_silent_connection_ends_also_if_no_caller_waits_until_the_timeout() {
+    let mut client = Client::new(Transport::Tcp);
+    let start = client.now;
+    while client.connection.closed().is_none() {
+        let tickets = [client.send(read()), client.send(read())];
+        client.after(SECOND / 2);
+        tickets.into_iter().for_each(|ticket| client.cancel(ticket));
+        assert!(client.now < start + 10 * SECOND, "three timeouts are enough");
+    }
+    assert!(client.now >= start + 3 * SECOND);
+    let silent = || Err(Failure::Closed(Closed::Silent));
+    assert_eq!(
+        client.got().into_iter().map(|(_, got)| got).collect::<Vec<_>>(),
+        [silent(), silent()]
+    );
+}
+
+#[test]
+fn requests_that_are_cancelled_end_no_connection_on_which_anything_is_received() {
+    let mut client = Client::new(Transport::Tcp);
+    for round in 0..10 {
+        let ticket = client.send(read());
+        client.after(SECOND / 2);
+        client.cancel(ticket);
+        assert_eq!(client.connection.deadline(), Some(client.now + SECOND / 2));
+        client.receive(&mbap_frame(round, 7, &[3, 2, 0, 1]));
+        assert_eq!(client.connection.deadline(), None);
+        client.after(SECOND);
+    }
+    assert_eq!((client.connection.late(), client.connection.closed()), (10, None));
+}
+
+#[test]
 fn any_received_byte_resets_the_timeouts() {
     let mut client = Client::new(Transport::Tcp);
     for round in 0..10 {

@@ -274,7 +274,7 @@ impl Connection {
             return self.flights.held;
         }
         match &self.wire {
-            Wire::Stream(_) => self.flights.deadline(),
+            Wire::Stream(stream) => stream.deadline(&self.flights),
             Wire::Datagrams(datagrams) => datagrams.deadline(&self.flights),
             Wire::OneAtATime(line) => line.deadline(&self.flights),
         }

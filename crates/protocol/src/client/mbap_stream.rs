@@ -29,6 +29,9 @@ pub(super) struct Stream {
     timeouts: u32,
     silent_since: Time,
     timed_out: Time,
+    /// The next deadline of a request whose caller has not waited for it, and when the request was sent.
+    /// `None` once a byte was received.
+    cut_short: Option<(Time, Time)>,
     /// Bytes that the header of an exception reply counted beyond its end. They may come, or not.
     surplus: usize,
 }
@@ -98,14 +101,18 @@ impl Stream {
         Some(ticket)
     }
 
-    /// Gives a request up: its reply, should it come, is dropped. One that waits for a pause is not
-    /// sent.
+    /// Gives a request up: its reply, should it come, is dropped. It still counts as a timeout at its
+    /// deadline: callers with less time than that must not stay on a dead connection. One that waits for
+    /// a pause is not sent.
     pub(super) fn cancel(&mut self, flights: &mut Flights, ticket: Ticket) {
         // While there is a pause, all requests are in `out`, in their order.
         let behind: usize = flights.after(ticket).map(frame_len).sum();
         let Some(flight) = flights.take(ticket) else { return };
         if flights.held.is_none() {
             self.given_up.insert(flight.transaction_id, GivenUp::new(&flight));
+            // Requests in flight at the same time count as one: the first deadline is enough.
+            let next = (flight.deadline, flight.sent);
+            self.cut_short = Some(self.cut_short.map_or(next, |first| first.min(next)));
             return;
         }
         let end = flights.out.len().saturating_sub(behind);
@@ -122,7 +129,7 @@ impl Stream {
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
-        self.timeouts = 0;
+        (self.timeouts, self.cut_short) = (0, None);
         let mut partial = core::mem::take(&mut self.partial);
         let mut rest = if partial.is_empty() {
             bytes
@@ -241,14 +248,12 @@ impl Stream {
         while let Some(flight) = flights.expired(now) {
             timed_out = true;
             self.given_up.insert(flight.transaction_id, GivenUp::new(&flight));
-            if self.timeouts == 0 || flight.sent >= self.timed_out {
-                if self.timeouts == 0 {
-                    self.silent_since = now;
-                }
-                self.timeouts += 1;
-                self.timed_out = now;
-            }
+            self.count_timeout(flight.sent, now);
             flights.end(flight, Err(Failure::Timeout), sink);
+        }
+        if let Some((_, sent)) = self.cut_short.take_if(|(deadline, _)| *deadline <= now) {
+            timed_out = true;
+            self.count_timeout(sent, now);
         }
         if timed_out && self.has_broken_off(flights) {
             flights.close(Closed::BrokenOff, sink);
@@ -257,6 +262,22 @@ impl Stream {
         {
             flights.close(Closed::Silent, sink);
         }
+    }
+
+    /// Counts the timeout of a request, unless one before was already counted while it was in flight.
+    fn count_timeout(&mut self, sent: Time, now: Time) {
+        if self.timeouts == 0 {
+            self.silent_since = now;
+        } else if sent < self.timed_out {
+            return;
+        }
+        self.timeouts += 1;
+        self.timed_out = now;
+    }
+
+    pub(super) fn deadline(&self, flights: &Flights) -> Option<Time> {
+        let cut_short = self.cut_short.map(|(deadline, _)| deadline);
+        flights.deadline().into_iter().chain(cut_short).min()
     }
 
     /// Whether another reply begins in the frame at the start of `bytes`, which was cut off: there is no check
