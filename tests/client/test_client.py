@@ -28,6 +28,7 @@ import pytest
 
 import holdfast
 from holdfast._core import BlockingClient, Request
+from holdfast.client import async_transports, tcp_connect
 from holdfast.client import endpoint as endpoints
 from holdfast.client.requests import TooManyValues
 from holdfast.client.url import NetworkTarget, SerialTarget, Tls, Tolerance, parse
@@ -1055,6 +1056,32 @@ def test_a_dead_connection_is_replaced_although_each_call_has_a_limit_of_its_own
     ) as device:
         asyncio.run(main(device.url))
         assert device.connections == 2
+
+
+def test_a_call_has_its_own_time_to_connect_although_another_one_has_begun(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tries = []
+
+    async def connected(*arguments: Any) -> socket.socket:
+        tries.append(arguments)
+        if len(tries) == 1:
+            await asyncio.Event().wait()
+        return await tcp_connect.connected(*arguments)
+
+    monkeypatch.setattr(async_transports, "connected", connected)
+    request = Request.read("holding_registers", 7, 1)
+
+    async def main(target: NetworkTarget) -> None:
+        transport = async_transports.AsyncConnection(target, endpoints.endpoint(target), 2)
+        calls = [transport.call(request, 1, timeout) for timeout in (0.05, wire.DEADLINE)]
+        short, long = await asyncio.gather(*calls, return_exceptions=True)
+        await transport.close()
+        assert isinstance(short, holdfast.RequestTimeout)
+        assert long == [7]
+
+    with Stream("tcp") as device:
+        asyncio.run(main(NetworkTarget("tcp", "127.0.0.1", device.port)))
 
 
 def test_the_only_call_may_be_cancelled_while_it_connects() -> None:

@@ -317,9 +317,7 @@ def test_a_write_whose_caller_gives_up_when_its_turn_comes_is_not_sent() -> None
     route = Route(target, (target,))
 
     async def run() -> None:
-        pool = Pool(
-            most=1, in_flight=1, idle=60, longest=60, dial=lambda _target, _in_flight: transport
-        )
+        pool = Pool(most=1, in_flight=1, idle=60, dial=lambda _target, _in_flight: transport)
 
         def start(request: Request) -> asyncio.Task[Any]:
             return asyncio.create_task(

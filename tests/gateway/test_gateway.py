@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -403,6 +404,35 @@ def test_after_a_timeout_the_next_request_has_a_new_connection(client: web.Clien
     with FakeDevice(lambda pdu: registers(pdu, 5) if next(replies) else None) as device:
         assert read(client, device, timeout=500).json["error"] == "Connection timeout"
         assert read(client, device).json["values"] == [5]
+
+
+def test_a_dead_connection_is_replaced_although_requests_overlap() -> None:
+    first: list[Connection] = []
+
+    def answers_on_another_one(asked: Asked) -> None:
+        if asked.peer is not first[0]:
+            asked.answer()
+
+    def greet(connection: Connection, _: int) -> None:
+        first.append(connection)
+
+    with (
+        Stream("tcp", then=answers_on_another_one, greet=greet) as device,
+        gateways.running(limits={"in_flight": 4}) as running,
+        ThreadPoolExecutor(4) as threads,
+    ):
+
+        def is_answered(number: int) -> bool:
+            where = {"host": "127.0.0.1", "port": device.port, "functionCode": 3}
+            body = {**where, "address": number, "timeout": 200 + 50 * number}
+            return running.ask("/read", body).status == 200
+
+        def goes_on(number: int) -> None:
+            until = time.monotonic() + wire.DEADLINE
+            while not is_answered(number):
+                assert time.monotonic() < until, "there is no other connection"
+
+        list(threads.map(goes_on, range(4)))
 
 
 def test_what_is_no_reply_is_told(client: web.Client) -> None:

@@ -47,7 +47,7 @@ def failing_pool(transport: Failing, dialed: list[NetworkTarget]) -> Pool:
         dialed.append(target)
         return transport
 
-    return Pool(most=1, in_flight=1, idle=60, longest=60, dial=dial)
+    return Pool(most=1, in_flight=1, idle=60, dial=dial)
 
 
 def test_requests_behind_a_connection_that_can_not_be_closed_are_sent(

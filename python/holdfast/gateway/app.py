@@ -101,7 +101,6 @@ class App(Application):
             most=limits.devices,
             in_flight=limits.in_flight,
             idle=limits.idle,
-            longest=limits.timeout,
             tls=settings.tls,
             dial=dial,
             shared=None if poller is None else Shared(poller),

@@ -57,7 +57,6 @@ class _Device:
 
     key: NetworkTarget
     transport: AsyncTransport
-    timeout: float
     most: int
     """The most requests in flight."""
     in_flight: int = 0
@@ -121,7 +120,7 @@ class Pool:
     """At most `most` clients, by target. A client is closed after `idle` seconds without use.
 
     Over TCP and TLS, at most `in_flight` requests to a device are pending at once; over other
-    transports one. Further requests wait. `longest` is the longest timeout of a request in seconds.
+    transports one. Further requests wait.
     """
 
     def __init__(
@@ -130,7 +129,6 @@ class Pool:
         most: int,
         in_flight: int,
         idle: float,
-        longest: float,
         tls: Tls = NO_FILES,
         dial: Dial = connection,
         shared: Shared | None = None,
@@ -138,7 +136,6 @@ class Pool:
         self._most = most
         self._in_flight = in_flight
         self._idle = idle
-        self._longest = longest
         self._tls = tls
         self._dial = dial
         self._shared = shared
@@ -194,15 +191,13 @@ class Pool:
         try:
             if device.doubtful and device.in_flight == 1:
                 await self._refresh(device)
-            # Calls over TCP and TLS end when they are cancelled, others only at their timeout.
-            device.timeout = self._longest if key.transport in IN_FLIGHT else timeout
             device.doubtful = True
             result = None
             if is_broadcast(key.transport, unit):
                 await device.transport.close()  # The peer may accept only one connection.
                 await send(self._dial(key, 1), request, timeout)
             else:
-                result = await device.transport.call(request, unit, device.timeout)
+                result = await device.transport.call(request, unit, timeout)
             device.doubtful = False
             return result
         except ModbusException:
@@ -211,7 +206,7 @@ class Pool:
         finally:
             device.used = time.monotonic()
             if device.doubtful:
-                device.needed = device.used + device.timeout + MAX_LATENESS_S
+                device.needed = device.used + timeout + MAX_LATENESS_S
 
     def pass_on(self, device: _Device) -> None:
         """Gives the place of a request that has ended to those that wait."""
@@ -266,7 +261,7 @@ class Pool:
         if device is None:
             gone = self._pushed_out() if len(self._entries) >= self._most else None
             most = self._in_flight if key.transport in IN_FLIGHT else 1
-            device = self._entries[key] = _Device(key, transport, self._longest, most)
+            device = self._entries[key] = _Device(key, transport, most)
             if gone is not None:
                 device.users += 1
                 try:
