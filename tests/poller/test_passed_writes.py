@@ -290,6 +290,22 @@ def test_a_device_that_has_gone_is_exception_10(run: Run) -> None:
         assert scada.read_holding_registers(11, 1) == [501]
 
 
+@pytest.mark.parametrize("emulate", [True, False], ids=["a read and a write", "a write"])
+def test_a_device_to_which_no_connection_can_be_made_is_exception_10(
+    run: Run, *, emulate: bool
+) -> None:
+    pause = {"first": 0.001, "most": 0.001}
+    with wire.dead_address() as (host, port):
+        settings = {**RARELY, "retry": pause, "timeout": 0.1, "emulate": emulate}
+        meter = device(f"tcp://{host}:{port}", *READS, **settings)
+        appliance = run(configuration({"meter": meter}, **MORE))
+        wire.until(lambda: counters(appliance, "meter")["timeouts"], "a poll has failed")
+        with client(appliance) as scada:
+            for _ in range(3):
+                with refused_with(10):
+                    scada.mask_write(12, and_mask=0xFF00, or_mask=0x0011)
+
+
 def test_a_sealed_memory_passes_nothing_on(run: Run, caplog: pytest.LogCaptureFixture) -> None:
     with plc() as source:
         meter = device(source.url, *READS, **RARELY)

@@ -5,11 +5,12 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_protocol::pdu::EncodedRequest;
+use holdfast_protocol::client::InvalidResponse;
+use holdfast_protocol::pdu::{EncodedRequest, ResponseError};
 use holdfast_runtime::Retry;
 use tokio::time::Instant;
 
-use super::fault::{Answer, Exchanged, Fault, fault};
+use super::fault::{Answer, Exchanged, fault};
 use crate::client::{ClientError, Endpoint, Place, StrayCounters};
 use crate::link::limits::permit::Permit;
 use crate::link::scheduling::in_flight::{Alone, InFlight, Pace, Place as Turn};
@@ -63,21 +64,33 @@ impl Link {
         priority: Priority,
         permit: &Permit,
     ) -> Answer {
+        let answer = self.call_explained(unit_id, request, timeout, priority, permit).await;
+        answer.map_err(|error| fault(&error))
+    }
+
+    /// As [`call`](Link::call), with the error.
+    pub(crate) async fn call_explained(
+        &self,
+        unit_id: u8,
+        request: &EncodedRequest,
+        timeout: Duration,
+        priority: Priority,
+        permit: &Permit,
+    ) -> Exchanged {
         let _turn = match permit.until {
             None => self.turn(POLLER, priority).await,
             // In a box, so that polls do not carry the room for it.
             Some(_) => {
                 let turn = Box::pin(self.turn(POLLER, priority));
-                permit.in_time(turn).await.ok_or(Fault::Expired)?
+                permit.in_time(turn).await.ok_or(ClientError::Expired)?
             }
         };
         let eager = priority == Priority::Urgent;
         let answer = self.exchange(unit_id, request, timeout, eager, permit).await;
-        answer.map_err(|error| {
-            let fault = fault(&error);
-            self.error.replace(Some(error));
-            fault
-        })
+        if let Err(error) = &answer {
+            self.error.replace(Some(Arc::clone(error)));
+        }
+        answer
     }
 
     /// Why the last [`call`](Link::call) that failed did.
@@ -85,9 +98,9 @@ impl Link {
         self.error.borrow().clone()
     }
 
-    /// As [`call`](Link::call), for a read and then the write that `write` makes of its answer. No other
-    /// request is sent between the two. There is nothing to write if `write` returns `None`: the answer
-    /// is [`Fault::Invalid`] then.
+    /// As [`call_explained`](Link::call_explained), for a read and then the write that `write` makes of its
+    /// answer. No other request is sent between the two. There is nothing to write if `write` returns `None`:
+    /// the answer is invalid then.
     pub(crate) async fn read_then_write(
         &self,
         unit_id: u8,
@@ -95,12 +108,12 @@ impl Link {
         write: impl FnOnce(&[u8]) -> Option<EncodedRequest>,
         timeout: Duration,
         permit: &Permit,
-    ) -> Answer {
+    ) -> Exchanged {
         let _alone: Alone<'_> = self.pace.alone(POLLER, Priority::Urgent).await;
-        let answer = self.exchange(unit_id, read, timeout, true, permit).await;
-        let write = write(&answer.map_err(|error| fault(&error))?).ok_or(Fault::Invalid)?;
-        let answer = self.exchange(unit_id, &write, timeout, true, permit).await;
-        answer.map_err(|error| fault(&error))
+        let answer = self.exchange(unit_id, read, timeout, true, permit).await?;
+        let invalid = || ClientError::Invalid(InvalidResponse::Pdu(ResponseError::Length));
+        let write = write(&answer).ok_or_else(invalid)?;
+        self.exchange(unit_id, &write, timeout, true, permit).await
     }
 
     /// Waits for a turn, which lasts as long as the result.
@@ -169,6 +182,7 @@ mod tests {
     use tokio::task::LocalSet;
 
     use super::*;
+    use crate::link::fault::Fault;
     use crate::name_lookup;
 
     #[test]

@@ -69,28 +69,19 @@ impl Fault {
     pub(crate) fn is_answer(self) -> bool {
         matches!(self, Fault::Exception(code) if !UNREACHED.contains(&code))
     }
-
-    /// The code of the exception that a client of a gateway gets for it (V1.1b3, 7): that of the device,
-    /// or that its address could not be reached. After that one, clients send a write again: nothing was
-    /// sent. Any other fault counts as a device that did not answer.
-    pub(crate) fn exception(self) -> u8 {
-        match self {
-            Fault::Exception(code) => code,
-            Fault::Refused | Fault::Unreachable | Fault::Standby => {
-                ExceptionCode::GatewayPathUnavailable.code()
-            }
-            _ => ExceptionCode::GatewayTargetFailedToRespond.code(),
-        }
-    }
 }
 
-/// As [`Fault::exception`], for an error, which also shows a timeout before anything was sent.
-pub(super) fn exception_code(error: &ClientError) -> u8 {
-    match error {
-        ClientError::ConnectTimeout { .. } | ClientError::LookupTimeout { .. } => {
-            Fault::Unreachable.exception()
+/// The code of the exception that a client of a gateway gets for an error (V1.1b3, 7): that of the device,
+/// or that its address could not be reached. After that one, clients send a write again: nothing was sent.
+/// Any other error counts as a device that did not answer.
+pub(crate) fn exception_code(error: &ClientError) -> u8 {
+    match (error, fault(error)) {
+        (_, Fault::Exception(code)) => code,
+        (ClientError::ConnectTimeout { .. } | ClientError::LookupTimeout { .. }, _)
+        | (_, Fault::Refused | Fault::Unreachable | Fault::Standby) => {
+            ExceptionCode::GatewayPathUnavailable.code()
         }
-        _ => fault(error).exception(),
+        _ => ExceptionCode::GatewayTargetFailedToRespond.code(),
     }
 }
 

@@ -20,7 +20,7 @@ pub(crate) use access::Link;
 pub(crate) use caller::Waiting;
 pub use caller::{Called, Caller};
 pub use fault::Fault;
-pub(crate) use fault::{confirmation, exception, exception_in, fault};
+pub(crate) use fault::{confirmation, exception, exception_code, exception_in, fault};
 pub use limits::lease_fence::{Fence, Stage};
 pub(crate) use limits::lease_fence::{Pass, submit_under};
 pub(crate) use limits::permit::{Permit, Wanted};

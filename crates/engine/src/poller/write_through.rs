@@ -17,8 +17,8 @@ use super::destination::ReadSettings;
 use crate::client::ClientError;
 use crate::items::{Items, touched};
 use crate::link::{
-    Caller, Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, Wanted,
-    confirmation, exception, exception_in, pending_reply, submit_under,
+    Caller, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, Wanted, confirmation,
+    exception, exception_code, exception_in, pending_reply, submit_under,
 };
 
 /// The most writes into one memory that wait for devices.
@@ -256,7 +256,7 @@ impl PassedWrite {
         }
         let of_client = Permit { wanted: Some(self.reply.wanted()), ..permit.clone() };
         let call = async |request: &EncodedRequest, permit| {
-            link.call(unit_id, request, timeout, Priority::Urgent, permit).await
+            link.call_explained(unit_id, request, timeout, Priority::Urgent, permit).await
         };
         let mask = match self.request.request() {
             Some(Request::MaskWriteRegister { address, and_mask, or_mask }) => {
@@ -286,20 +286,19 @@ impl PassedWrite {
                     // confirmed, although the device has carried it out.
                     value = call(&read(address), permit).await.ok().and_then(|pdu| register(&pdu));
                     let unknown =
-                        Fault::Exception(ExceptionCode::GatewayTargetFailedToRespond.code());
-                    if value.is_some() { Ok(answer) } else { Err(unknown) }
+                        ClientError::Exception(ExceptionCode::GatewayTargetFailedToRespond.code());
+                    if value.is_some() { Ok(answer) } else { Err(unknown.into()) }
                 }
                 refused => refused,
             },
             None => call(&self.request, &of_client).await,
         };
-        let pdu = match answered {
+        match answered {
             Ok(answer) => return self.confirm(&answer, value, reads, permit).await,
             // Its client has gone, and it was not sent.
-            Err(Fault::Expired) => return Vec::new(),
-            Err(fault) => exception(&self.pdu, fault.exception()),
-        };
-        self.reply.send(pdu);
+            Err(error) if matches!(*error, ClientError::Expired) => {}
+            Err(error) => self.reply.send(exception(&self.pdu, exception_code(&error))),
+        }
         Vec::new()
     }
 
