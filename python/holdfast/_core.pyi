@@ -1454,10 +1454,9 @@ class Caller:
         """
 
     def withdraw(self, ticket: int) -> bool:
-        """Gives a call up: it is not sent if its turn has not come.
+        """Gives a call up: it is not sent if it was not sent yet.
 
-        Returns whether its turn has come, so that the device may have received the request. Such a
-        call still has a result.
+        Returns whether the device may have received the request. Such a call still has a result.
         """
 
 @final

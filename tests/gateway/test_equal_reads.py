@@ -301,7 +301,13 @@ class SlowTransport:
     def __init__(self) -> None:
         self.calls: list[tuple[int, asyncio.Event]] = []
 
-    async def call(self, request: Request, unit: int, timeout: float) -> Any:  # noqa: ARG002
+    async def call(
+        self,
+        request: Request,
+        unit: int,  # noqa: ARG002
+        timeout: float,  # noqa: ARG002
+        note_sent: Callable[[], None] | None = None,  # noqa: ARG002
+    ) -> Any:
         released = asyncio.Event()
         self.calls.append((request.pdu[0], released))
         await released.wait()

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from schemathesis import Case
     from schemathesis.specs.openapi.schemas import OpenApiSchema
 
-    from holdfast.client.async_transports import AsyncTransport
+    from holdfast.client.async_transports import OwnTransport
     from holdfast.client.url import NetworkTarget
     from holdfast.config.models.services import Compat
     from support.gateways import Running
@@ -60,7 +60,7 @@ class Everywhere(Dialed):
         super().__init__()
         self._device = device
 
-    def __call__(self, target: NetworkTarget, in_flight: int) -> AsyncTransport:
+    def __call__(self, target: NetworkTarget, in_flight: int) -> OwnTransport:
         host, port = self._device
         return super().__call__(replace(target, host=host, port=port), in_flight)
 

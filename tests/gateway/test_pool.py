@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
@@ -17,6 +17,9 @@ from holdfast.gateway.shared_devices import Turns
 from holdfast.net.http.requests import BadRequest
 from support import wire
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
 READ = Request.read("coils", 0, 1)
 
 
@@ -29,7 +32,15 @@ class Failing:
         self.outcomes = list(outcomes)
         self.is_closing, self.may_fail = asyncio.Event(), asyncio.Event()
 
-    async def call(self, request: Request, unit: int, timeout: float) -> Any:  # noqa: ARG002
+    async def call(
+        self,
+        request: Request,  # noqa: ARG002
+        unit: int,  # noqa: ARG002
+        timeout: float,  # noqa: ARG002
+        note_sent: Callable[[], None] | None = None,
+    ) -> Any:
+        assert note_sent is not None
+        note_sent()
         outcome = self.outcomes.pop(0)
         if isinstance(outcome, Exception):
             raise outcome
@@ -130,7 +141,13 @@ class Unstoppable(Failing):
         self.calls = 0
         self.may_answer = [asyncio.Event(), asyncio.Event()]
 
-    async def call(self, request: Request, unit: int, timeout: float) -> Any:  # noqa: ARG002
+    async def call(
+        self,
+        request: Request,  # noqa: ARG002
+        unit: int,  # noqa: ARG002
+        timeout: float,  # noqa: ARG002
+        note_sent: Callable[[], None] | None = None,  # noqa: ARG002
+    ) -> Any:
         event = self.may_answer[self.calls]
         self.calls += 1
         try:

@@ -566,8 +566,8 @@ def test_a_request_that_had_no_turn_says_that_it_was_not_sent() -> None:
         answer = running.ask("/read", read(device, timeout=50))
         assert (answer.status, answer.headers["holdfast-reason"]) == (500, "timeout")
         assert answer.json["error"] == (
-            "Connection timeout: the request waited behind other requests to this device, "
-            "and was not sent"
+            "Connection timeout: the request was not sent: there was no connection, or it waited "
+            "behind other requests to this device"
         )
         device.stop()
         assert waiting.result(wire.DEADLINE).headers["holdfast-reason"] == "connection_lost"

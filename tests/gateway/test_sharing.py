@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from support.running import Connect, Run
 
 READ = bytes.fromhex("0300050001")
-WAITED = (
-    "Connection timeout: the request waited behind other requests to this device, and was not sent"
+UNSENT = (
+    "Connection timeout: the request was not sent: there was no connection, or it waited behind "
+    "other requests to this device"
 )
 
 
@@ -215,12 +216,32 @@ def test_a_write_that_was_given_up_before_its_turn_is_never_sent(
         appliance = run(with_gateway(device.url))
         first = held_back(appliance, threads, device)
         late = ask(appliance, "/write/register", device.port, address=5, value=1, timeout=50)
-        assert failure(late) == (500, "timeout", WAITED)
+        assert failure(late) == (500, "timeout", UNSENT)
         held.release()
         assert first.result().json["values"] == [100]
         assert read(appliance, device.port, 6).json["values"] == [6]
         await_count(appliance, "withdrawn", 1)
     assert [asked.pdu[0] for asked in device.requests] == [3, 3]
+
+
+@pytest.mark.parametrize("is_shared", [True, False], ids=["shared", "own"])
+def test_a_write_without_a_connection_was_not_sent(
+    run: Run, threads: ThreadPoolExecutor, *, is_shared: bool
+) -> None:
+    with wire.dead_address() as (_, port), Stream("tcp") as other:
+        used = port if is_shared else other.port
+        appliance = run(with_gateway(f"tcp://127.0.0.1:{used}"))
+        # The turn of the second one comes when the first one has ended.
+        late = [
+            threads.submit(
+                ask, appliance, "/write/register", port, address=5, value=1, timeout=timeout
+            )
+            for timeout in (100, 300)
+        ]
+        for each in late:
+            answer = each.result()
+            assert failure(answer) == (500, "timeout", UNSENT)
+            assert answer.headers["holdfast-maybe-written"] == "false"
 
 
 def test_a_write_goes_before_reads_that_wait(run: Run, threads: ThreadPoolExecutor) -> None:

@@ -20,7 +20,7 @@ from support.event_streams import EventStream
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from holdfast.client.async_transports import AsyncTransport
+    from holdfast.client.async_transports import OwnTransport
     from holdfast.client.url import NetworkTarget
     from holdfast.net.resolver import Resolve
 
@@ -35,7 +35,7 @@ class Dialed:
         self.calls: list[NetworkTarget] = []
         self._elsewhere = elsewhere or {}
 
-    def __call__(self, target: NetworkTarget, in_flight: int) -> AsyncTransport:
+    def __call__(self, target: NetworkTarget, in_flight: int) -> OwnTransport:
         self.calls.append(target)
         host, port = self._elsewhere.get((target.host, target.port), (target.host, target.port))
         there = replace(target, host=host, port=port)

@@ -61,6 +61,20 @@ class AsyncTransport(Protocol):
         """How many seconds the slowest of them took; 0 if there were none."""
 
 
+class OwnTransport(AsyncTransport, Protocol):
+    """Has a connection of its own."""
+
+    def call(
+        self,
+        request: Request,
+        unit: int,
+        timeout: float,
+        note_sent: Callable[[], None] | None = None,
+    ) -> Awaitable[Any]:
+        """Calls `note_sent` when the device may receive the request from now on."""
+        ...
+
+
 class ThreadedConnection:
     """A transport with one request at a time, in a thread of its own."""
 
@@ -77,8 +91,16 @@ class ThreadedConnection:
         self._core = BlockingClient(self._endpoint, self._trace)
         self._executor, self._closed = None, Event()
 
-    async def call(self, request: Request, unit: int, timeout: float) -> Any:
+    async def call(
+        self,
+        request: Request,
+        unit: int,
+        timeout: float,
+        note_sent: Callable[[], None] | None = None,
+    ) -> Any:
         """Sends a request after the calls before it, and waits for the result."""
+        if note_sent is not None:
+            note_sent()  # The thread may send it at any time.
         if self._executor is None:
             self._executor, self._closed = ThreadPoolExecutor(1, "holdfast-client"), Event()
             end_at_exit(self)
@@ -164,7 +186,13 @@ class AsyncConnection:
     def _connect_anew(self) -> None:
         self._last: _LoopConnection | None = None
 
-    async def call(self, request: Request, unit: int, timeout: float) -> Any:
+    async def call(
+        self,
+        request: Request,
+        unit: int,
+        timeout: float,
+        note_sent: Callable[[], None] | None = None,
+    ) -> Any:
         """Sends a request as soon as a place is free, and waits for the result.
 
         Raises `RuntimeError` while the client is in use in another event loop.
@@ -190,6 +218,8 @@ class AsyncConnection:
                 if here.has_pauses or attempt is not None:
                     now = here.time()
                     left = max(deadline - now, 0.0)
+                if note_sent is not None:
+                    note_sent()
                 try:
                     future = connection.send(request, unit, left, now, attempt)
                 except ConnectionLost:

@@ -13,12 +13,12 @@ from holdfast.client.url import IN_FLIGHT, NetworkTarget
 from holdfast.values.integers import as_integer
 
 if TYPE_CHECKING:
-    from holdfast.client.async_transports import AsyncTransport
+    from holdfast.client.async_transports import OwnTransport
     from holdfast.client.base import Trace
     from holdfast.client.url import Target
 
 
-def connection(target: Target, max_in_flight: int, trace: Trace | None = None) -> AsyncTransport:
+def connection(target: Target, max_in_flight: int, trace: Trace | None = None) -> OwnTransport:
     """The connection to a device, for asyncio. It connects on its first call."""
     if isinstance(target, NetworkTarget) and target.transport in IN_FLIGHT:
         return AsyncConnection(target, endpoint(target), max_in_flight, trace)

@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-TOO_MANY_BEFORE = (
-    "Connection timeout: the request waited behind other requests to this device, and was not sent"
+NOT_SENT = (
+    "Connection timeout: the request was not sent: there was no connection, or it waited behind "
+    "other requests to this device"
 )
 NO_BROADCAST = (
     "unitId 0 is the broadcast of a serial line, which has no response; with transport "
@@ -81,9 +82,9 @@ class RequestedDevice:
         self.rtt = 0
         """The duration of the last call, in milliseconds."""
         self.maybe_sent = False
-        """Whether a call was started, so that the device may have received a request."""
-        self._is_waiting = False
-        """Whether the last call has waited until its end for its turn."""
+        """Whether the device may have received a request."""
+        self._is_unsent = False
+        """Whether the last call has sent nothing."""
         self._egress = egress
         self._pool = pool
 
@@ -147,12 +148,12 @@ class RequestedDevice:
         finally:
             is_sent = turns is not None and turns.is_sent
             self.maybe_sent |= is_sent
-            self._is_waiting = not is_sent
+            self._is_unsent = not is_sent
             self.rtt = round(1000 * (time.perf_counter() - began))
 
     def _timed_out(self) -> str:
-        if self._is_waiting:
-            return TOO_MANY_BEFORE
+        if self._is_unsent:
+            return NOT_SENT
         return "Connection timeout" if self.unit else f"Connection timeout: {UNIT_0}"
 
 

@@ -21,7 +21,7 @@ from holdfast._core import MAX_LATENESS_S
 from holdfast.client.client import connection
 from holdfast.client.endpoint import check_files
 from holdfast.client.url import IN_FLIGHT, NetworkTarget
-from holdfast.errors import ConnectionLost, ModbusException
+from holdfast.errors import ConnectionLost, ModbusException, RequestTimeout
 from holdfast.gateway.broadcast import is_broadcast, send
 from holdfast.gateway.shared_devices import Turns
 from holdfast.gateway.shared_reads import WaitingRequests
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from holdfast._core import Request
-    from holdfast.client.async_transports import AsyncTransport
+    from holdfast.client.async_transports import OwnTransport
     from holdfast.gateway.egress import Route
     from holdfast.gateway.shared_devices import Shared
     from holdfast.net.tls import Tls
 
 Result = TypeVar("Result")
 
-Dial: TypeAlias = "Callable[[NetworkTarget, int], AsyncTransport]"
+Dial: TypeAlias = "Callable[[NetworkTarget, int], OwnTransport]"
 """Creates the connection to an address, for a number of requests in flight. It connects when it is
 first used. Raises `OSError` and `ValueError` for TLS files that can't be used."""
 
@@ -56,7 +56,7 @@ class _Device:
     """A connection, its users, and the requests that wait for it."""
 
     key: NetworkTarget
-    transport: AsyncTransport
+    transport: OwnTransport
     most: int
     """The most requests in flight."""
     in_flight: int = 0
@@ -89,16 +89,15 @@ class _PoolTurns(Turns):
         earlier = self.is_sent
         try:
             return await self._call(self._device, request, unit, timeout)
-        except ConnectionLost as error:
+        except (ConnectionLost, RequestTimeout) as error:
             self.is_sent = error.maybe_sent = earlier or error.maybe_sent
             raise
 
     async def _call(self, device: _Device, request: Request, unit: int, timeout: float) -> Any:
         if device.in_flight < device.most:
             device.in_flight += 1
-            self.is_sent = True
             try:
-                return await self._pool.send(device, request, unit, timeout)
+                return await self._pool.send(device, request, unit, timeout, self._note_sent)
             finally:
                 self._pool.pass_on(device)
         waiting = device.waiting.join(request, unit, timeout)
@@ -112,8 +111,11 @@ class _PoolTurns(Turns):
             if not waiting.callers:
                 if waiting.worker is not None:
                     waiting.worker.cancel()
-                elif not waiting.is_sent:
+                elif waiting.is_queued:
                     device.waiting.leave(waiting)
+
+    def _note_sent(self) -> None:
+        self.is_sent = True
 
 
 class Pool:
@@ -185,7 +187,14 @@ class Pool:
         finally:
             device.users -= 1
 
-    async def send(self, device: _Device, request: Request, unit: int, timeout: float) -> Any:
+    async def send(
+        self,
+        device: _Device,
+        request: Request,
+        unit: int,
+        timeout: float,
+        note_sent: Callable[[], None],
+    ) -> Any:
         """Sends a request whose turn has come, and returns the result."""
         key = device.key
         try:
@@ -195,9 +204,10 @@ class Pool:
             result = None
             if is_broadcast(key.transport, unit):
                 await device.transport.close()  # The peer may accept only one connection.
+                note_sent()
                 await send(self._dial(key, 1), request, timeout)
             else:
-                result = await device.transport.call(request, unit, timeout)
+                result = await device.transport.call(request, unit, timeout, note_sent)
             device.doubtful = False
             return result
         except ModbusException:
@@ -239,10 +249,12 @@ class Pool:
                     await asyncio.sleep(0)  # They have given up, and leave the queue next.
                     continue
                 device.waiting.leave(now)
-                now.is_sent, now.worker = True, worker
+                now.worker = worker
                 outcome: Any
                 try:
-                    outcome = await self.send(device, now.request, now.unit, now.timeout)
+                    outcome = await self.send(
+                        device, now.request, now.unit, now.timeout, now.note_sent
+                    )
                 except asyncio.CancelledError:
                     if now.callers:  # The pool ends.
                         raise
@@ -270,12 +282,12 @@ class Pool:
                     device.users -= 1
         return device
 
-    async def _dialed(self, key: NetworkTarget) -> AsyncTransport:
+    async def _dialed(self, key: NetworkTarget) -> OwnTransport:
         if key.transport != "tls":
             return self._dial(key, self._in_flight)
         return await asyncio.to_thread(self._dial_tls, key)
 
-    def _dial_tls(self, key: NetworkTarget) -> AsyncTransport:
+    def _dial_tls(self, key: NetworkTarget) -> OwnTransport:
         """Returns a connection with TLS. Blocks, because it reads the TLS files."""
         try:
             return self._dial(key, self._in_flight)

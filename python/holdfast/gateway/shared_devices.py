@@ -13,7 +13,13 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from holdfast.client.endpoint import endpoint
-from holdfast.errors import ConnectionLost, InvalidResponse, ModbusError, ModbusException
+from holdfast.errors import (
+    ConnectionLost,
+    InvalidResponse,
+    ModbusError,
+    ModbusException,
+    RequestTimeout,
+)
 from holdfast.gateway.broadcast import is_broadcast
 from holdfast.polling.calls import Calls
 
@@ -112,7 +118,7 @@ class Turns:
     def __init__(self, target: NetworkTarget) -> None:
         self.target = target
         self.is_sent = False
-        """Whether the turn of a request has come, so that the device may have received it."""
+        """Whether the device may have received a request."""
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
         """Sends a request when its turn comes. Raises `QueueFull` and the errors of a client.
@@ -145,7 +151,7 @@ class _LinkTurns(Turns):
         except asyncio.CancelledError:
             self.is_sent |= self._calls.caller.withdraw(ticket)
             raise
-        if isinstance(result, ConnectionLost):
+        if isinstance(result, ConnectionLost | RequestTimeout):
             sent = result.maybe_sent = self.is_sent or (sent and result.maybe_sent)
         self.is_sent |= sent
         if not isinstance(result, ModbusError):

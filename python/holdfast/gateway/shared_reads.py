@@ -33,7 +33,13 @@ class Waiting:
     callers: list[asyncio.Future[Any]] = field(default_factory=list)
     worker: asyncio.Task[None] | None = None
     """Sends it; `None` before its turn, and after its end."""
+    is_queued: bool = True
     is_sent: bool = False
+    """Whether the device may have received it."""
+
+    def note_sent(self) -> None:
+        """The device may receive it from now on."""
+        self.is_sent = True
 
     def end(self, outcome: Any) -> None:
         """Gives all callers the result or the error."""
@@ -85,6 +91,7 @@ class WaitingRequests:
     def leave(self, one: Waiting) -> None:
         """Removes a request, because it is sent now or has no callers any more."""
         self._queue.remove(one)
+        one.is_queued = False
         read = one.unit, one.request.pdu
         if self._reads.get(read) is one:
             del self._reads[read]

@@ -50,7 +50,7 @@ pub struct Called {
     pub request: EncodedRequest,
     /// The PDU of a reply, empty after a broadcast.
     pub outcome: Result<Vec<u8>, Arc<ClientError>>,
-    /// Whether the turn of the request had come, so that the device may have received it.
+    /// Whether the device may have received the request.
     pub is_sent: bool,
 }
 
@@ -97,8 +97,8 @@ impl Caller {
         (ticket, Waiting { caller, ticket, timeout, until, longest_wait, is_broadcast, has_ended })
     }
 
-    /// Gives a call up: it is not sent if its turn has not come. Returns whether its turn has come; such a
-    /// call still has a result.
+    /// Gives a call up: it is not sent if it was not sent yet. Returns whether it may have been; such a call
+    /// still has a result.
     pub fn withdraw(&self, ticket: u64) -> bool {
         let mut state = lock(&self.state);
         let is_sent = state.pending.get(&ticket).is_none_or(|pending| pending.is_sent);
@@ -152,15 +152,13 @@ impl Waiting {
         self.left().is_zero() || !lock(&self.caller.state).pending.contains_key(&self.ticket)
     }
 
-    /// Its turn has come. Returns whether it has not been given up.
-    pub(crate) fn note_sent(&self) -> bool {
-        self.caller.note_sent(self.ticket)
-    }
-
-    /// As [`note_sent`](Waiting::note_sent), for a [`Permit`](crate::link::Permit).
+    /// Whether it has not been given up, for a [`Permit`](crate::link::Permit). Notes that it is sent.
     pub(crate) fn wanted(&self) -> Wanted {
         let (caller, ticket) = (Arc::clone(&self.caller), self.ticket);
-        Arc::new(move || caller.note_sent(ticket))
+        Arc::new(move |is_sent| match is_sent {
+            true => caller.note_sent(ticket),
+            false => lock(&caller.state).pending.contains_key(&ticket),
+        })
     }
 
     pub(crate) fn end(mut self, outcome: Result<Vec<u8>, Arc<ClientError>>) {
@@ -209,7 +207,7 @@ mod tests {
         let calls: Vec<_> = (0..3).map(|_| caller.begin(&read(), TIMEOUT, false)).collect();
         assert_eq!(woken(&wakes), 0);
         for (_, waiting) in calls {
-            waiting.note_sent();
+            waiting.wanted()(true);
             waiting.end(Ok(vec![3, 2, 0, 7]));
         }
         assert_eq!(woken(&wakes), 1);
@@ -226,7 +224,7 @@ mod tests {
         let (caller, wakes) = Caller::new().unwrap();
         let (ticket, waiting) = caller.begin(&read(), TIMEOUT, false);
         assert!(!waiting.is_unwanted());
-        assert!(!caller.withdraw(ticket), "its turn has not come");
+        assert!(!caller.withdraw(ticket), "it was not sent");
         assert!(waiting.is_unwanted());
         waiting.end(Ok(vec![3, 2, 0, 7]));
         assert!(caller.take().is_empty());
@@ -234,17 +232,18 @@ mod tests {
     }
 
     #[test]
-    fn a_call_whose_turn_has_come_has_a_result_although_it_was_given_up() {
+    fn a_call_that_was_sent_has_a_result_although_it_was_given_up() {
         let (caller, _wakes) = Caller::new().unwrap();
         let (ticket, waiting) = caller.begin(&read(), Duration::MAX, false);
-        assert!(waiting.note_sent());
-        assert!(caller.withdraw(ticket), "its turn has come");
+        assert!(waiting.wanted()(true));
+        assert!(caller.withdraw(ticket), "it was sent");
         waiting.end(Ok(vec![3, 2, 0, 7]));
         assert_eq!(caller.take().len(), 1);
 
         let (ticket, waiting) = caller.begin(&read(), Duration::MAX, false);
+        assert!(waiting.wanted()(false), "there is no connection yet");
         assert!(!caller.withdraw(ticket));
-        assert!(!waiting.note_sent(), "it is not sent");
+        assert!(!waiting.wanted()(true), "it is not sent");
     }
 
     #[test]

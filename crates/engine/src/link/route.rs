@@ -319,20 +319,11 @@ impl Reply {
         }
     }
 
-    /// What is asked at the last moment before the request is sent. Event loops know by then that its turn
-    /// has come.
-    pub(super) fn wanted(&self) -> Option<Wanted> {
+    /// What is asked at the last moment before the request is sent.
+    pub(super) fn wanted(&self) -> Wanted {
         match &self.to {
-            Receiver::Listener(to, _) => Some(to.wanted()),
-            Receiver::EventLoop(_) => None,
-        }
-    }
-
-    /// Its turn has come. Returns whether it is still wanted.
-    pub(super) fn is_next(&self) -> bool {
-        match &self.to {
-            Receiver::Listener(to, _) => !to.is_unwanted(),
-            Receiver::EventLoop(to) => to.note_sent(),
+            Receiver::Listener(to, _) => to.wanted(),
+            Receiver::EventLoop(to) => to.wanted(),
         }
     }
 }

@@ -8,8 +8,8 @@ use tokio::time::timeout_at;
 use crate::client::ClientError;
 use crate::link::limits::lease_fence::Fence;
 
-/// Whether somebody still waits for the answer to a request that is sent now.
-pub(crate) type Wanted = Arc<dyn Fn() -> bool + Send + Sync>;
+/// Whether somebody still waits for the answer to a request. Called with true when it is sent now.
+pub(crate) type Wanted = Arc<dyn Fn(bool) -> bool + Send + Sync>;
 
 /// Until when a request may be sent. The default is without a limit.
 #[derive(Clone, Default)]
@@ -23,19 +23,21 @@ pub(crate) struct Permit {
 }
 
 impl Permit {
+    /// `is_sent`: whether the request is sent now.
+    ///
     /// # Errors
     /// [`ClientError::Fenced`] or [`ClientError::Expired`].
-    pub fn check(&self) -> Result<(), ClientError> {
+    pub fn check(&self, is_sent: bool) -> Result<(), ClientError> {
         if self.fence.as_ref().is_some_and(|fence| !fence.allows()) {
             return Err(ClientError::Fenced);
         }
-        if self.is_expected() { Ok(()) } else { Err(ClientError::Expired) }
+        if self.is_expected(is_sent) { Ok(()) } else { Err(ClientError::Expired) }
     }
 
     /// Whether its caller still expects it to be sent.
-    pub fn is_expected(&self) -> bool {
+    pub fn is_expected(&self, is_sent: bool) -> bool {
         self.until.is_none_or(|until| Instant::now() < until)
-            && self.wanted.as_ref().is_none_or(|wanted| wanted())
+            && self.wanted.as_ref().is_none_or(|wanted| wanted(is_sent))
     }
 
     /// Waits for a turn; `None` if it does not come in time.

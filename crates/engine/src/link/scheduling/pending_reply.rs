@@ -82,7 +82,7 @@ impl ReplyTo {
     /// Whether the client has not disconnected, for a [`Permit`](crate::link::Permit).
     pub(crate) fn wanted(&self) -> Wanted {
         let client = Arc::clone(&self.client);
-        Arc::new(move || !client.is_gone.load(Ordering::Relaxed))
+        Arc::new(move |_| !client.is_gone.load(Ordering::Relaxed))
     }
 
     /// Waits until the client has disconnected.

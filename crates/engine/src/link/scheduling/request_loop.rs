@@ -15,7 +15,7 @@ use crate::client::ClientError;
 use crate::link::access::Link;
 use crate::link::fault::{Exchanged, Fault, exception, exception_code, fault};
 use crate::link::limits::circuit_breaker::{CircuitBreakers, Down, OPEN_AFTER_TIMEOUTS};
-use crate::link::limits::permit::Permit;
+use crate::link::limits::permit::{Permit, Wanted};
 use crate::link::route::{Call, LinkSettings, Reply, SharedLink};
 use crate::link::scheduling::shared_reads::{SharedReads, shareable};
 use crate::link::scheduling::write_barrier::Order;
@@ -98,14 +98,17 @@ impl Serving {
             return;
         }
         // Callers that have given up already know that nothing is sent.
-        replies.retain(Reply::is_next);
+        replies.retain(|reply| !reply.is_unwanted());
         let Some(timeout) = replies.iter().map(Reply::timeout).max() else {
             return counters.withdrawn.add();
         };
         let changes = self.link.changes.get();
-        // A line may still wait for late replies to others. What several share is a read.
-        let wanted = if let [reply] = &replies[..] { reply.wanted() } else { None };
-        let permit = Permit { wanted, ..Permit::default() };
+        // There may be no connection yet, and a line may still wait for late replies to others. Each caller
+        // is asked: each notes whether its request is sent.
+        let wanted: Vec<_> = replies.iter().map(Reply::wanted).collect();
+        let wanted: Wanted =
+            Arc::new(move |is_sent| wanted.iter().filter(|wanted| wanted(is_sent)).count() > 0);
+        let permit = Permit { wanted: Some(wanted), ..Permit::default() };
         let answered = self.link.exchange(unit_id, &request, timeout, true, &permit).await;
         drop(turn);
         if matches!(&answered, Err(error) if matches!(**error, ClientError::Expired)) {

@@ -137,7 +137,7 @@ impl TcpLink {
             if let (Some(open), Some(fence)) = (self.open.borrow_mut().as_mut(), &permit.fence) {
                 open.pass.get_or_insert_with(|| fence.pass());
             }
-            permit.check()?;
+            permit.check(true)?;
             let began = pace.began();
             let outcome = self.carry_out(unit_id, request, deadline, attempt, permit).await;
             let Some((answer, again)) = outcome.unwrap_or_else(|lost| Some((Err(lost), None)))
@@ -202,7 +202,7 @@ impl TcpLink {
         if let Some(ended) = self.ended.get() {
             sleep_until((ended + self.tolerance.reconnect).min(deadline)).await;
         }
-        permit.check()?;
+        permit.check(false)?;
         let found =
             match timeout_at(deadline, name_lookup::addresses_of(&self.host, self.port)).await {
                 Ok(found) => found,
@@ -389,7 +389,7 @@ impl Open {
             held.clear();
         }
         held.retain(|(ticket, permit)| {
-            if permit.is_expected() {
+            if permit.is_expected(false) {
                 return true;
             }
             connection.cancel(*ticket, now.saturating_duration_since(*epoch));
