@@ -114,6 +114,13 @@ def test_single_writes_take_the_functions_for_several_where_the_device_needs_it(
     assert [asked.pdu[0] for asked in device.requests] == [16, 15, 3]
 
 
+def test_single_writes_to_a_device_that_is_only_polled_do_so_too(run: Run) -> None:
+    with Stream("tcp", in_turn=True) as device, Stream("tcp") as other:
+        appliance = run(with_gateway(other.url, **polled(f"{device.url}?write_multiple=1")))
+        assert ask(appliance, "/write/register", device.port, address=1, value=51).json["success"]
+    assert 16 in {asked.pdu[0] for asked in device.requests}
+
+
 def test_a_silent_device_is_waited_for_no_longer_than_by_clients_of_the_link(run: Run) -> None:
     with Stream("tcp", then=silent) as device:
         appliance = run(with_gateway(device.url, link={"timeout": 0.1}))

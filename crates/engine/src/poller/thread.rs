@@ -11,6 +11,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use holdfast_memory::Memory;
+use holdfast_protocol::client::Tolerance;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, limit};
 use holdfast_runtime::{Retry, lock};
 use thiserror::Error;
@@ -79,6 +80,8 @@ pub struct Polled {
     /// The settings of `forwards`.
     receivers: Arc<[ForwardSettings]>,
     address: Arc<Address>,
+    /// What the device needs. The devices at one address have the same.
+    tolerance: Tolerance,
 }
 
 impl Polled {
@@ -94,6 +97,7 @@ impl Polled {
             report: device.report.clone(),
             receivers: device.forward.as_slice().into(),
             address,
+            tolerance: device.endpoint.tolerance,
         }
     }
 
@@ -283,10 +287,15 @@ impl Poller {
     /// [`PollerError::Stopped`].
     pub fn known_link(
         &self,
-        settings: LinkSettings,
+        mut settings: LinkSettings,
     ) -> Result<Option<Arc<SharedLink>>, PollerError> {
         let address = address(&settings.endpoint);
-        let is_known = lock(&self.polled).values().any(|device| *device.address == address) || {
+        let polled = lock(&self.polled);
+        let polled = polled.values().find(|device| *device.address == address);
+        let is_known = if let Some(polled) = polled {
+            settings.endpoint.tolerance = polled.tolerance;
+            true
+        } else {
             let all = lock(&self.shared);
             all.iter().any(|(other, link)| *other == address && link.strong_count() > 0)
         };
