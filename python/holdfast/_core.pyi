@@ -1579,6 +1579,13 @@ class Poller:
         Returns `None` if none does. Raises `RuntimeError` after `stop`.
         """
 
+    def forget_links(self, used: Sequence[Link]) -> None:
+        """Forgets the links that no device and none of `used` has.
+
+        The next user of such an address gets a new one, with its own settings. Raises
+        `RuntimeError` after `stop`.
+        """
+
     def passage(
         self,
         memory: Memory,

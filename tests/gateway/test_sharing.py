@@ -251,6 +251,19 @@ def test_a_write_without_a_connection_was_not_sent(
             assert answer.headers["holdfast-maybe-written"] == "false"
 
 
+def test_a_device_that_returns_has_its_new_settings(run: Run, tmp_path: Path) -> None:
+    with Stream("tcp", in_turn=True) as device, Stream("tcp") as other:
+        file = tmp_path / "appliance.yaml"
+        before = polled(device.url)
+        appliance = run(with_gateway(other.url, **before))
+        assert read(appliance, device.port, 5).json["values"] == [5]
+        for sections in ({**before, "devices": {}}, polled(f"{device.url}?write_multiple=1")):
+            file.write_text(with_gateway(other.url, **sections))
+            appliance.reload(load(file))
+        assert ask(appliance, "/write/register", device.port, address=1, value=51).json["success"]
+        assert 16 in {asked.pdu[0] for asked in device.requests}
+
+
 def test_a_write_goes_before_reads_that_wait(run: Run, threads: ThreadPoolExecutor) -> None:
     held = Held()
     with Stream("tcp", held) as device:

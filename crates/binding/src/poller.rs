@@ -190,6 +190,11 @@ impl Poller {
         Ok(known.map(|core| Link { core }))
     }
 
+    fn forget_links(&self, used: Vec<PyRef<'_, Link>>) -> PyResult<()> {
+        let used: Vec<_> = used.iter().map(|link| Arc::clone(&link.core)).collect();
+        self.core.forget_links(&used).map_err(raised)
+    }
+
     fn passage(
         &self,
         memory: PyRef<'_, Memory>,

@@ -74,9 +74,9 @@ class Shared:
         return self._known_link(target) is not None
 
     def forget_unused(self, latest: float) -> None:
-        """Releases the links that were last used before `latest`."""
+        """Releases the links that were last used before `latest`, or that a reload has removed."""
         for target, (_, used) in list(self._held.items()):
-            if used < latest:
+            if used < latest or not self.knows(target):
                 del self._held[target]
         for target, (_, read_at) in list(self._endpoints.items()):
             if read_at < latest:
@@ -89,9 +89,10 @@ class Shared:
         self._held.clear()
 
     def _link(self, target: NetworkTarget) -> Link | None:
-        held = self._held.get(target)
-        link = self._known_link(target) if held is None else held[0]
-        if link is not None:
+        link = self._known_link(target)  # A reload may have replaced the one that is held.
+        if link is None:
+            self._held.pop(target, None)
+        else:
             self._held[target] = link, time.monotonic()
         return link
 

@@ -1,9 +1,10 @@
 //! Runs all devices on one thread. Devices can be added and removed, and are stopped together.
 
 use std::cell::RefCell;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::io;
 use std::net::IpAddr;
+use std::ptr;
 use std::rc::{self, Rc};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, Weak};
@@ -139,6 +140,8 @@ enum Command {
         at_once: bool,
     },
     Remove(String),
+    /// The next user of the address gets a new link.
+    Forget(Address),
     /// Serves a link that listeners use.
     Serve(Box<LinkSettings>, Weak<SharedLink>, mpsc::UnboundedReceiver<Call>),
     Write {
@@ -300,6 +303,24 @@ impl Poller {
             all.iter().any(|(other, link)| *other == address && link.strong_count() > 0)
         };
         is_known.then(|| self.link(settings)).transpose()
+    }
+
+    /// Forgets the links that no device and none of `used` has: the next user of such an address gets a new
+    /// one, with its own settings.
+    ///
+    /// # Errors
+    /// [`PollerError::Stopped`].
+    pub fn forget_links(&self, used: &[Arc<SharedLink>]) -> Result<(), PollerError> {
+        let polled = lock(&self.polled);
+        let polled: HashSet<_> = polled.values().map(|device| &*device.address).collect();
+        let mut all = lock(&self.shared);
+        for (address, _) in all.extract_if(.., |(address, link)| {
+            let is_used = used.iter().any(|used| ptr::eq(Arc::as_ptr(used), link.as_ptr()));
+            !is_used && !polled.contains(address)
+        }) {
+            self.send(Command::Forget(address))?;
+        }
+        Ok(())
     }
 
     /// Passes writes into ranges of a memory on to the devices that they are read from.
@@ -473,6 +494,9 @@ async fn run_commands(
             Command::Serve(settings, shared, calls) => {
                 let link = links.to(&settings.endpoint, (settings.in_flight, settings.retry));
                 spawn_local(serve(link, *settings, shared, calls));
+            }
+            Command::Forget(address) => {
+                links.by_address.remove(&address);
             }
             Command::Remove(name) => {
                 let removed = running.remove(&name);

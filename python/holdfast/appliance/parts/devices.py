@@ -116,6 +116,8 @@ class Devices(Part):
                         poller.replace(name, device, at_once=False)
                     else:
                         poller.add(device)
+                # The gateway may hold some that are out of use, with settings that may come back.
+                poller.forget_links(list(self._links.values()))
             if values is not None:
                 values.have_begun(replaced)
             self._polled = polled
