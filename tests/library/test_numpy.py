@@ -163,6 +163,16 @@ def test_values_of_another_type_are_refused(value: Any, kind: str) -> None:
         values.encode(value, kind)
 
 
+def test_a_finite_number_too_large_for_a_float_is_refused() -> None:
+    large = numpy.finfo(numpy.longdouble).max
+    # Where numpy has no floats with more bits, float32 is too small all the same.
+    kind = "float32" if large == numpy.finfo(numpy.float64).max else "float64"
+    for value, wanted in [(large, kind), ([1.0, -large], f"{kind}[2]")]:
+        with pytest.raises(DoesNotFit, match="is outside"):
+            values.encode(value, wanted)
+    assert values.encode(numpy.longdouble("inf"), "float64") == [0x7FF0, 0, 0, 0]
+
+
 def test_values_are_decoded() -> None:
     assert values.decode([numpy.uint16(1), numpy.int64(2)], "uint32") == 65538
     assert values.decode([YES, False], "bool[2]") == [True, False]

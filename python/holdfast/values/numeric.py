@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from abc import abstractmethod
+from math import isinf
 from numbers import Real
 from typing import TYPE_CHECKING, Any
 
@@ -120,7 +121,11 @@ class Float(Number):
     def _number(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, Real):
             raise DoesNotFit(f"{shown(value)} is not a number, which {self.name} requires")
-        return float(value)
+        number = float(value)
+        # A float of numpy with more bits, which `float` does not refuse.
+        if isinf(number) and value != number:
+            raise OverflowError
+        return number
 
 
 class Bcd(Bytewise):
