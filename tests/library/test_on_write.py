@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import subprocess
 import sys
 import threading
@@ -18,6 +19,21 @@ if TYPE_CHECKING:
     from support.running import Serve
 
 Call = tuple[str, int, list[int]]
+
+FORKS = """
+import os, sys, threading, holdfast
+memory = holdfast.Memory(holding_registers=100)
+writing = memory.on_write(lambda area, address, values: None)
+def write():
+    while True:
+        memory.write("holding_registers", 0, [1] * 100)
+threading.Thread(target=write, daemon=True).start()
+for _ in range(100):
+    child = os.fork()
+    if not child:
+        sys.exit(writing.dropped)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+"""
 
 
 class Calls:
@@ -223,6 +239,16 @@ def test_a_program_ends_with_a_callback_that_waits() -> None:
     )
     done = subprocess.run(
         [sys.executable, "-c", code], check=False, capture_output=True, timeout=wire.DEADLINE * 3
+    )
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="requires fork")
+def test_a_forked_child_ends_whatever_the_threads_of_its_parent_do() -> None:
+    # Python 3.12 and later warn of a fork while threads run.
+    words = ["-W", "ignore::DeprecationWarning", "-c", FORKS]
+    done = subprocess.run(
+        [sys.executable, *words], check=False, capture_output=True, timeout=wire.DEADLINE * 3
     )
     assert (done.returncode, done.stderr) == (0, b"")
 

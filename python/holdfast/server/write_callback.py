@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import inspect
+import os
 import threading
 from typing import TYPE_CHECKING, Self
 
@@ -31,6 +32,7 @@ class WriteCallback:
             raise TypeError(f"callback is {callback!r}, an async def, allowed: a plain function")
         self._queue = queue
         self._callback = callback
+        self._process = os.getpid()
         self._thread = threading.Thread(target=self._run, name="holdfast-on-write", daemon=True)
         # A thread that waits in native code must have ended before the interpreter does.
         atexit.register(self.close)
@@ -38,16 +40,26 @@ class WriteCallback:
 
     @property
     def dropped(self) -> int:
-        """How many writes were dropped because the callback is too slow."""
-        return self._queue.dropped
+        """How many writes were dropped because the callback is too slow; 0 in a forked child."""
+        return 0 if self._is_in_child else self._queue.dropped
 
     def close(self) -> None:
         """Ends the calls, and waits for one that runs for up to a second. Writes that wait for the
-        callback are dropped. Can be called from any thread, also from the callback.
+        callback are dropped. Can be called from any thread, also from the callback. Does nothing in
+        a forked child, which has no calls.
         """
+        if self._is_in_child:
+            return
         self._queue.close()
         if threading.current_thread() is not self._thread:
             self._thread.join(CALLBACK_END_TIMEOUT_S)
+
+    @property
+    def _is_in_child(self) -> bool:
+        """Whether this is a copy in a forked child: a thread of the parent may hold the lock of the
+        queue, and does not release it here.
+        """
+        return os.getpid() != self._process
 
     def _run(self) -> None:
         while not self._queue.is_closed:
