@@ -679,11 +679,12 @@ def test_what_is_no_request_is_answered_as_all_errors_are(sent: bytes) -> None:
     assert answer.json["success"] is False
 
 
-def test_a_request_of_http_1_0_needs_no_host() -> None:
+@pytest.mark.parametrize("wish", ["", "Connection: keep-alive\r\n"])
+def test_a_request_of_http_1_0_needs_no_host_and_is_the_last_one(wish: str) -> None:
     with gateways.running() as running, wire.Connection(running.address) as connection:
-        connection.send(b"GET /api/gateway HTTP/1.0\r\n\r\n")
+        connection.send(f"GET /api/gateway HTTP/1.0\r\n{wish}\r\n".encode())
         [answer] = web.answers(connection.rest())
-    assert answer.status == 200
+    assert (answer.status, answer.headers["connection"]) == (200, "close")
 
 
 def test_too_many_streams_are_told_to_come_again(server: holdfast.Server) -> None:

@@ -246,6 +246,7 @@ fn answered(
 ) -> impl Future<Output = Result<Response<Output>, Abandoned>> {
     let exchange = front.exchange();
     let len = request.body().size_hint().exact();
+    let version = request.version();
     let expects = request.headers().contains_key(EXPECT);
     let (is_ambiguous, has_body) = {
         let mut line = line.lock();
@@ -253,11 +254,15 @@ fn answered(
         (line.begin(Arc::clone(&exchange), len), has_body)
     };
     async move {
-        if is_ambiguous {
+        let mut response = if is_ambiguous {
             front.ended(Kind::BrokenRequest, line.lock().peer.clone());
-            return Ok(refused(&front, exchange, line));
-        }
-        handled(front, line, exchange, request, has_body).await
+            refused(&front, exchange, line)
+        } else {
+            handled(front, line, exchange, request, has_body).await?
+        };
+        // After one of HTTP/1.1, hyper would promise to keep a connection that ends.
+        *response.version_mut() = version;
+        Ok(response)
     }
 }
 
