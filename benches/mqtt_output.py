@@ -141,6 +141,7 @@ class Site:
     """A site without devices: only values are published."""
 
     revision = answers = 0
+    standby: frozenset[str] = frozenset()
 
     def __init__(self) -> None:
         self.retained: dict[tuple[str, str], str] = {}
