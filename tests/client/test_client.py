@@ -1048,7 +1048,7 @@ def test_a_dead_connection_is_replaced_although_each_call_has_a_limit_of_its_own
                     async with asyncio.timeout(0.1):
                         await plc.read_holding_registers(0, 1)
                     break
-                except TimeoutError:
+                except (TimeoutError, holdfast.ConnectionLost):
                     continue
 
     with Stream(
