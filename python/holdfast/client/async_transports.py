@@ -401,7 +401,7 @@ class _LoopConnection:
 
     async def connected(self, deadline: float, timeout: float) -> Connection:
         """The connection; connects if necessary. Several calls can wait for the same attempt."""
-        is_own = self._connecting is None
+        is_own, closes = self._connecting is None, self.closes
         if self._connecting is None:
             self._connecting = self.loop.create_task(self._connect(timeout))
             self._connecting.add_done_callback(self._connect_ended)
@@ -413,6 +413,8 @@ class _LoopConnection:
             raise _closed_before_sent()
         failure = connecting.exception()
         if isinstance(failure, RequestTimeout) and not is_own and self.loop.time() < deadline:
+            if self.closes != closes:
+                raise _closed_before_sent()
             return await self.connected(deadline, timeout)  # The other call had less time.
         if isinstance(failure, ModbusError):
             raise copy.copy(failure) from failure.__cause__

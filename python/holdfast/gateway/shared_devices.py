@@ -76,7 +76,8 @@ class Shared:
     def forget_unused(self, latest: float) -> None:
         """Releases the links that were last used before `latest`, or that a reload has removed."""
         for target, (_, used) in list(self._held.items()):
-            if used < latest or not self.knows(target):
+            is_judged = target.transport != "tls" or target in self._endpoints
+            if used < latest or (is_judged and not self.knows(target)):
                 del self._held[target]
         for target, (_, read_at) in list(self._endpoints.items()):
             if read_at < latest:

@@ -35,7 +35,7 @@ class Calls(asyncio.Protocol):
         return future
 
     def withdraw(self, ticket: int) -> None:
-        """Gives a call up whose turn has not come. It ends with the result `None`, not sent."""
+        """Gives a call up that was not sent yet. It ends with the result `None`, not sent."""
         future = self._futures.get(ticket)
         if not self.caller.withdraw(ticket) and future is not None and not future.done():
             future.set_result((False, None))

@@ -79,7 +79,7 @@ impl Caller {
         Ok((Arc::new(caller), wakes))
     }
 
-    /// A new call. Nothing ends it at its timeout if its turn has not come: its caller must withdraw it.
+    /// A new call. Nothing ends it at its timeout if it was not sent: its caller must withdraw it.
     pub(crate) fn begin(
         self: &Arc<Caller>,
         request: &EncodedRequest,

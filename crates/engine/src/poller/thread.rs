@@ -81,7 +81,7 @@ pub struct Polled {
     /// The settings of `forwards`.
     receivers: Arc<[ForwardSettings]>,
     address: Arc<Address>,
-    /// What the device needs. The devices at one address have the same.
+    /// What the device needs. At one address, what the first device needs counts.
     tolerance: Tolerance,
 }
 
@@ -294,8 +294,8 @@ impl Poller {
     ) -> Result<Option<Arc<SharedLink>>, PollerError> {
         let address = address(&settings.endpoint);
         let polled = lock(&self.polled);
-        let polled = polled.values().find(|device| *device.address == address);
-        let is_known = if let Some(polled) = polled {
+        let polled = polled.values().filter(|device| *device.address == address);
+        let is_known = if let Some(polled) = polled.min_by_key(|device| device.number) {
             settings.endpoint.tolerance = polled.tolerance;
             true
         } else {

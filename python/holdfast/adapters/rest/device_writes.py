@@ -1,6 +1,6 @@
 """Writes that go to devices in place of a memory: each waits for its turn and for the answer.
 
-A write whose turn has not come is withdrawn when its client has gone, and when the server ends. One
+A write that was not sent yet is withdrawn when its client has gone, and when the server ends. One
 that was sent is waited for, and recorded with the answer of the device.
 """
 
@@ -37,7 +37,7 @@ class DeviceWrites:
         self._is_ending = False
 
     def end(self) -> None:
-        """Withdraws all writes whose turn has not come. Called in the thread of the server."""
+        """Withdraws all writes that were not sent yet. Called in the thread of the server."""
         self._is_ending = True
         if self._calls is not None:
             for ticket in self._tickets:
