@@ -1447,7 +1447,8 @@ def test_a_pause_before_the_next_connection_may_be_longer_than_the_timeout(dial:
             except holdfast.ModbusError:
                 failures += 1
                 assert failures < 100
-        assert device.connections == 2
+        # On a loaded machine, a reply may come too late.
+        assert device.connections == len(device.requests)
 
 
 # Event loops

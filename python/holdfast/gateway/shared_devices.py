@@ -148,10 +148,14 @@ class _LinkTurns(Turns):
         ticket = self._link.call(self._calls.caller, request, unit, left, broadcast=broadcast)
         if ticket is None:
             raise QueueFull
+        answer = self._calls.result(ticket)
         try:
-            sent, result = await self._calls.result(ticket)
+            sent, result = await answer
         except asyncio.CancelledError:
-            self.is_sent |= self._calls.caller.withdraw(ticket)
+            if answer.cancelled():
+                self.is_sent |= self._calls.caller.withdraw(ticket)
+            else:  # It has ended just before.
+                self.is_sent |= answer.result()[0]
             raise
         if isinstance(result, ConnectionLost | RequestTimeout):
             sent = result.maybe_sent = self.is_sent or (sent and result.maybe_sent)

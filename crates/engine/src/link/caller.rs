@@ -101,7 +101,15 @@ impl Caller {
     /// still has a result.
     pub fn withdraw(&self, ticket: u64) -> bool {
         let mut state = lock(&self.state);
-        let is_sent = state.pending.get(&ticket).is_none_or(|pending| pending.is_sent);
+        let is_sent = match state.pending.get(&ticket) {
+            Some(pending) => pending.is_sent,
+            // It has just ended.
+            None => state
+                .done
+                .iter()
+                .find(|called| called.ticket == ticket)
+                .is_none_or(|called| called.is_sent),
+        };
         if !is_sent {
             state.pending.remove(&ticket);
         }
@@ -244,6 +252,10 @@ mod tests {
         assert!(waiting.wanted()(false), "there is no connection yet");
         assert!(!caller.withdraw(ticket));
         assert!(!waiting.wanted()(true), "it is not sent");
+
+        let (ticket, waiting) = caller.begin(&read(), Duration::MAX, false);
+        waiting.end(Err(ClientError::Expired.into()));
+        assert!(!caller.withdraw(ticket), "it has ended unsent");
     }
 
     #[test]
