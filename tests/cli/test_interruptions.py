@@ -24,14 +24,14 @@ def test_a_signal_ends_a_search_after_what_must_not_be_cut() -> None:
     def search(signals: Signals) -> None:
         with signals.interrupting():
             with signals.held():
-                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(signal.SIGTERM)
                 done.append("line")
             done.append("search")
 
     with interruptions() as signals:
         with pytest.raises(Interrupted):
             search(signals)
-        assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL
+        assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
         done.append("output")
     assert done == ["line", "output"]
 

@@ -1448,7 +1448,7 @@ def test_a_pause_before_the_next_connection_may_be_longer_than_the_timeout(dial:
                 failures += 1
                 assert failures < 100
         # On a loaded machine, a reply may come too late.
-        assert device.connections == len(device.requests)
+        assert 2 <= device.connections <= len(device.requests)
 
 
 # Event loops
