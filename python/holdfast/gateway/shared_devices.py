@@ -152,10 +152,7 @@ class _LinkTurns(Turns):
         try:
             sent, result = await answer
         except asyncio.CancelledError:
-            if answer.cancelled():
-                self.is_sent |= self._calls.caller.withdraw(ticket)
-            else:  # It has ended just before.
-                self.is_sent |= answer.result()[0]
+            self.is_sent |= self._calls.give_up(ticket, answer)
             raise
         if isinstance(result, ConnectionLost | RequestTimeout):
             sent = result.maybe_sent = self.is_sent or (sent and result.maybe_sent)

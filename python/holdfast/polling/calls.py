@@ -34,6 +34,11 @@ class Calls(asyncio.Protocol):
         future.add_done_callback(lambda _: self._futures.pop(ticket))
         return future
 
+    def give_up(self, ticket: int, result: asyncio.Future[tuple[bool, Any]]) -> bool:
+        """Gives a call up whose caller was cancelled. Returns whether it may have been sent."""
+        # It may have ended just before.
+        return self.caller.withdraw(ticket) if result.cancelled() else result.result()[0]
+
     def withdraw(self, ticket: int) -> None:
         """Gives a call up that was not sent yet. It ends with the result `None`, not sent."""
         future = self._futures.get(ticket)

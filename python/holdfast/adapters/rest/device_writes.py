@@ -76,7 +76,7 @@ class DeviceWrites:
         except asyncio.CancelledError:
             # Nobody waits for the answer any more: the record of the write must say so.
             with contextlib.suppress(Refused), self._memory_access.refusing(begun):
-                if not calls.caller.withdraw(ticket):
+                if not calls.give_up(ticket, answer):
                     raise _withdrawn(begun) from None
                 self._memory_access.answered(begun, TARGET_SILENT)
             raise

@@ -61,7 +61,7 @@ class SharedLogs(Part):
         self._logs: dict[str, _core.Log] = {}
         self._servers: dict[str, NatsServer] = {}
         self.restored: set[str] = set()
-        """The memories whose contents come from a log. Not those of a log that began here."""
+        """The memories whose contents other nodes may have written before this process began."""
 
     def open(self, plan: Plan) -> None:
         """Returns when the memories have caught up.
