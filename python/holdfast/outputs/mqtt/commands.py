@@ -110,20 +110,20 @@ class Commands(CommandOutcomes):
         refused: NotWritten | None,
     ) -> None:
         """Notes an outcome, and replies. Called by any thread."""
-        if refused is not None and refused.reason == fault_word(STANDBY):
-            # The lease has just gone to another node, which replies.
-            with self._changed:
-                self._waiting -= 1
-                self._changed.notify_all()
-            return
-        self.ended(device, tag, refused)
-        reply = {"status": "accepted", "device": device, "tag": tag}
-        if refused is not None:
-            reply |= {"status": "rejected", "reason": refused.reason, "detail": refused.detail}
-        answer = self._answer(message, msgspec.json.encode(reply))
+        # The lease may just have gone to another node, which replies.
+        is_ours = refused is None or refused.reason != fault_word(STANDBY)
+        answer = None
+        if is_ours:
+            self.ended(device, tag, refused)
+            reply = {"status": "accepted", "device": device, "tag": tag}
+            if refused is not None:
+                reply |= {"status": "rejected", "reason": refused.reason, "detail": refused.detail}
+            answer = self._answer(message, msgspec.json.encode(reply))
         with self._changed:
             self._waiting -= 1
             self._changed.notify_all()
+            if not is_ours:
+                return
             self._replies = [each for each in self._replies if not each.is_done]
             if answer is None or len(self._replies) >= MAX_REPLIES or session.error is not None:
                 self.replies_dropped += 1
