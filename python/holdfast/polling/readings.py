@@ -47,6 +47,11 @@ class DevicePoll(NamedTuple):
     readings: list[Reading]
 
     @property
+    def is_standby(self) -> bool:
+        """Whether another node polls the device now: then there are no readings."""
+        return not self.readings
+
+    @property
     def has_answered(self) -> bool:
         """Whether the device answered at least once, be it with an exception."""
         return any(not reading.fault or is_exception(reading.fault) for reading in self.readings)

@@ -1,6 +1,6 @@
 //! A link as the poller uses it: its requests, in turns with those of others.
 
-use std::cell::{Cell, RefCell};
+use std::cell::Cell;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
@@ -10,7 +10,7 @@ use holdfast_protocol::pdu::{EncodedRequest, ResponseError};
 use holdfast_runtime::Retry;
 use tokio::time::Instant;
 
-use super::fault::{Answer, Exchanged, fault};
+use super::fault::Exchanged;
 use crate::client::{ClientError, Endpoint, Place, StrayCounters};
 use crate::link::limits::permit::Permit;
 use crate::link::scheduling::in_flight::{Alone, InFlight, Pace, Place as Turn};
@@ -26,8 +26,6 @@ pub(crate) struct Link {
     pub(super) wire: Wire,
     /// When an address that cannot be reached, or a unit that does not answer, is tried again.
     pub(crate) retry: Retry,
-    /// Why the last request of the poller that failed did.
-    error: RefCell<Option<Arc<ClientError>>>,
     /// Grows whenever a device may have changed by a request.
     pub(super) changes: Cell<u64>,
 }
@@ -50,26 +48,12 @@ impl Link {
             }
             _ => (Wire::Blocking(BlockingLink::new(endpoint, retry)), one),
         };
-        let (pace, error, changes) = (Pace::new(in_flight), RefCell::default(), Cell::default());
-        Rc::new(Link { pace, wire, retry, error, changes })
+        Rc::new(Link { pace: Pace::new(in_flight), wire, retry, changes: Cell::default() })
     }
 
     /// Sends a request of the poller when it is its turn, and waits for the answer. `timeout` does not
     /// include the wait for the turn. Devices of one link have the same fence, or none.
     pub(crate) async fn call(
-        &self,
-        unit_id: u8,
-        request: &EncodedRequest,
-        timeout: Duration,
-        priority: Priority,
-        permit: &Permit,
-    ) -> Answer {
-        let answer = self.call_explained(unit_id, request, timeout, priority, permit).await;
-        answer.map_err(|error| fault(&error))
-    }
-
-    /// As [`call`](Link::call), with the error.
-    pub(crate) async fn call_explained(
         &self,
         unit_id: u8,
         request: &EncodedRequest,
@@ -86,21 +70,12 @@ impl Link {
             }
         };
         let eager = priority == Priority::Urgent;
-        let answer = self.exchange(unit_id, request, timeout, eager, permit).await;
-        if let Err(error) = &answer {
-            self.error.replace(Some(Arc::clone(error)));
-        }
-        answer
+        self.exchange(unit_id, request, timeout, eager, permit).await
     }
 
-    /// Why the last [`call`](Link::call) that failed did.
-    pub(crate) fn error(&self) -> Option<Arc<ClientError>> {
-        self.error.borrow().clone()
-    }
-
-    /// As [`call_explained`](Link::call_explained), for a read and then the write that `write` makes of its
-    /// answer. No other request is sent between the two. There is nothing to write if `write` returns `None`:
-    /// the answer is invalid then.
+    /// As [`call`](Link::call), for a read and then the write that `write` makes of its answer. No other
+    /// request is sent between the two. There is nothing to write if `write` returns `None`: the answer is
+    /// invalid then.
     pub(crate) async fn read_then_write(
         &self,
         unit_id: u8,
@@ -182,7 +157,7 @@ mod tests {
     use tokio::task::LocalSet;
 
     use super::*;
-    use crate::link::fault::Fault;
+    use crate::link::fault::{Fault, fault};
     use crate::name_lookup;
 
     #[test]
@@ -205,7 +180,7 @@ mod tests {
                 let link = Link::new(endpoint, InFlight::Fixed(1), Retry::default());
                 let (priority, permit) = (Priority::Usual, Permit::default());
                 let answer = link.call(1, &read, Duration::from_millis(1), priority, &permit).await;
-                assert_eq!(answer, Err(Fault::Timeout), "{told}");
+                assert_eq!(fault(&answer.unwrap_err()), Fault::Timeout, "{told}");
                 assert!(link.retry_at().is_some(), "{told}");
             }
         });

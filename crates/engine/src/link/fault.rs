@@ -108,11 +108,8 @@ pub(crate) fn confirmation(request: &[u8]) -> &[u8] {
     }
 }
 
-/// The PDU of a reply, empty after a broadcast; or the fault.
-pub(crate) type Answer = Result<Vec<u8>, Fault>;
-
-/// As [`Answer`], with the error.
-pub(super) type Exchanged = Result<Vec<u8>, Arc<ClientError>>;
+/// The PDU of a reply, empty after a broadcast; or the error.
+pub(crate) type Exchanged = Result<Vec<u8>, Arc<ClientError>>;
 
 /// The error of requests that are not sent because of a flood.
 pub(super) const FLOODED: ClientError = ClientError::Invalid(InvalidResponse::Flood);

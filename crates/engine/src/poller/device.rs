@@ -18,7 +18,8 @@ use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use holdfast_memory::{Access, Area, Memory, Outcome, Refusal, Write};
-use holdfast_protocol::pdu::{EncodedRequest, Range, Request};
+use holdfast_protocol::client::InvalidResponse;
+use holdfast_protocol::pdu::{EncodedRequest, Range, Request, ResponseError};
 use holdfast_runtime::Retry;
 use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
@@ -35,8 +36,8 @@ use super::schedule::Schedule;
 use super::state::DeviceState;
 use super::status::{STATUS_INTERVAL, StatusSettings};
 use super::turn::Turn;
-use crate::client::Endpoint;
-use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority, submit_under};
+use crate::client::{ClientError, Endpoint};
+use crate::link::{Fault, Fence, InFlight, Link, Permit, Priority, fault, submit_under};
 
 /// Settings of a device.
 #[derive(Debug, Clone)]
@@ -619,18 +620,21 @@ impl Device {
         let fence = self.settings.fence.as_ref();
         let permit = Permit { fence: fence.cloned(), ..Permit::default() };
         let len = block.area.byte_len(block.count.into());
-        let answer =
-            self.link.call(*unit_id, &request, *timeout, priority, &permit).await.map(data);
+        let answer = self.link.call(*unit_id, &request, *timeout, priority, &permit).await;
         // A broadcast has no reply, and so no values.
+        let invalid = || ClientError::Invalid(InvalidResponse::Pdu(ResponseError::Length)).into();
         let answer = answer
-            .and_then(|bytes| if bytes.len() == len { Ok(bytes) } else { Err(Fault::Invalid) });
+            .map(data)
+            .and_then(|bytes| if bytes.len() == len { Ok(bytes) } else { Err(invalid()) });
         // After a stop of the process, a reply may be old, and another node may have read a newer one.
         if fence.is_some_and(|fence| !fence.allows()) {
             return Err(Fault::Standby);
         }
-        if answer.is_err() {
-            self.state.set_error(self.link.error());
-        }
+        let answer = answer.map_err(|error| {
+            let fault = fault(&error);
+            self.state.set_error(error);
+            fault
+        });
         match &answer {
             Ok(_) => {
                 let took = began.elapsed();

@@ -100,8 +100,8 @@ impl DeviceState {
         (fault(&error).code() == self.last_error()).then(|| error.to_string())
     }
 
-    pub(super) fn set_error(&self, error: Option<Arc<ClientError>>) {
-        *lock(&self.error) = error;
+    pub(super) fn set_error(&self, error: Arc<ClientError>) {
+        *lock(&self.error) = Some(error);
     }
 
     /// Why the device has no plan.

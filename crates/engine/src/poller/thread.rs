@@ -33,7 +33,8 @@ use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::{Endpoint, Place};
 use crate::heartbeat::Heartbeat;
 use crate::link::{
-    Call, Fault, Fence, InFlight, Link, LinkSettings, Permit, Priority, SharedLink, Stage, serve,
+    Call, Fault, Fence, InFlight, Link, LinkSettings, Permit, Priority, SharedLink, Stage, fault,
+    serve,
 };
 use crate::own_threads::OwnThreads;
 use crate::tls::client::Identity;
@@ -625,7 +626,8 @@ impl Running {
             if answer.is_ok() {
                 inbox.wake();
             }
-            to.push_write(Written { ticket, outcome: answer.map(drop) });
+            let outcome = answer.map(drop).map_err(|error| fault(&error));
+            to.push_write(Written { ticket, outcome });
         });
     }
 

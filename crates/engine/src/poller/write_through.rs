@@ -256,7 +256,7 @@ impl PassedWrite {
         }
         let of_client = Permit { wanted: Some(self.reply.wanted()), ..permit.clone() };
         let call = async |request: &EncodedRequest, permit| {
-            link.call_explained(unit_id, request, timeout, Priority::Urgent, permit).await
+            link.call(unit_id, request, timeout, Priority::Urgent, permit).await
         };
         let mask = match self.request.request() {
             Some(Request::MaskWriteRegister { address, and_mask, or_mask }) => {

@@ -81,16 +81,16 @@ class _Output:
     changes: Changes
     buffer: Buffer
 
-    def offer(self, polls: Iterable[tuple[str, Sequence[Reading]]]) -> None:
+    def offer(self, polls: Iterable[DevicePoll]) -> None:
         """Offers what is published of the polls of devices."""
         only = self.settings.devices
         offered = []
-        for device, readings in polls:
-            if only is not None and device not in only:
+        for poll in polls:
+            if only is not None and poll.device not in only:
                 continue
-            if not readings:  # Another node publishes until this one has the lease again.
-                self.changes.forget([device])
-            offered.append(self.changes.of(readings))
+            if poll.is_standby:  # Another node publishes until this one has the lease again.
+                self.changes.forget([poll.device])
+            offered.append(self.changes.of(poll.readings))
         self.buffer.offer(offered)
 
 
@@ -110,7 +110,7 @@ class TagValues:
         """When a replaced device began, in seconds since the poller's start: polls from before are
         those of the device that it has replaced."""
         self._outputs: dict[str, _Output] = {}
-        self._latest: dict[str, list[Reading]] = {}
+        self._latest: dict[str, DevicePoll] = {}
         self._answering: dict[str, bool] = {}
         self.standby: frozenset[str] = frozenset()
         """The devices with tags that another node polls. Replaced as a whole."""
@@ -215,7 +215,7 @@ class TagValues:
     def latest(self) -> list[Reading]:
         """The last reading of each tag. Thread-safe."""
         with self._lock:
-            return [reading for readings in self._latest.values() for reading in readings]
+            return [reading for poll in self._latest.values() for reading in poll.readings]
 
     def tags(self) -> dict[str, tuple[Tag, ...]]:
         """The tags of each device. Thread-safe."""
@@ -233,7 +233,7 @@ class TagValues:
         with self._lock:
             if (known := self._outputs.get(output)) is not None:
                 known.changes.forget(self._readers)
-                known.offer(self._latest.items())
+                known.offer(self._latest.values())
 
     def heartbeat(self) -> ThreadHeartbeat | None:
         """The heartbeat of the thread; `None` before the start."""
@@ -286,12 +286,12 @@ class TagValues:
 
     def _offer(self, polls: Sequence[DevicePoll]) -> None:
         for poll in polls:
-            self._latest[poll.device] = poll.readings
-            if (not poll.readings) is not (poll.device in self.standby):
+            self._latest[poll.device] = poll
+            if poll.is_standby is not (poll.device in self.standby):
                 self.standby ^= {poll.device}
             answers = poll.has_answered
             if self._answering.get(poll.device) is not answers:
                 self._answering[poll.device] = answers
                 self.answers += 1
         for output in self._outputs.values():
-            output.offer([(poll.device, poll.readings) for poll in polls])
+            output.offer(polls)

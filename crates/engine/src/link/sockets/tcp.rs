@@ -506,8 +506,7 @@ mod tests {
 
     use super::*;
     use crate::client::{Endpoint, Place};
-    use crate::link::fault::Answer;
-    use crate::link::{Fault, InFlight, Link, Priority};
+    use crate::link::{InFlight, Link, Priority};
 
     const TIMEOUT: Duration = Duration::from_secs(60);
 
@@ -520,7 +519,7 @@ mod tests {
         (listener, Link::new(endpoint, InFlight::Fixed(1), Retry::default()))
     }
 
-    async fn write_within(link: &Link, time: Duration) -> Answer {
+    async fn write_within(link: &Link, time: Duration) -> Exchanged {
         let request = Request::WriteSingleRegister { address: 0, value: 1 };
         let write = EncodedRequest::new(&request);
         let until = Some((Instant::now() + time).into_std());
@@ -554,7 +553,7 @@ mod tests {
             device.read_exact(&mut request).await.unwrap();
             let reply = [request[0], request[1], 0, 0, 0, 5, 1, 3, 2, 0, 7];
             device.write_all(&reply).await.unwrap();
-            assert_eq!(next.await.unwrap(), Ok(vec![3, 2, 0, 7]));
+            assert_eq!(next.await.unwrap().unwrap(), [3, 2, 0, 7]);
         });
     }
 
@@ -565,7 +564,7 @@ mod tests {
             let tolerance = Tolerance { pause_after_connect: TIMEOUT, ..Tolerance::default() };
             let (listener, link) = linked(tolerance).await;
             let answer = write_within(&link, Duration::from_millis(100)).await;
-            assert_eq!(answer, Err(Fault::Expired));
+            assert!(matches!(*answer.unwrap_err(), ClientError::Expired));
             let (mut device, _) = listener.accept().await.unwrap();
             drop(link);
             let mut received = Vec::new();
@@ -579,7 +578,8 @@ mod tests {
         let runtime = Builder::new_current_thread().enable_all().build().unwrap();
         LocalSet::new().block_on(&runtime, async {
             let (listener, link) = linked(Tolerance::default()).await;
-            assert_eq!(write_within(&link, Duration::ZERO).await, Err(Fault::Expired));
+            let answer = write_within(&link, Duration::ZERO).await;
+            assert!(matches!(*answer.unwrap_err(), ClientError::Expired));
             let none = tokio::time::timeout(Duration::ZERO, listener.accept()).await;
             assert!(none.is_err(), "nobody connects");
         });
