@@ -16,7 +16,7 @@ use crate::server::connections::admission::ConnectionLimits;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::event::{Kind, Reporter};
-use crate::server::rights::policy::contain;
+use crate::server::rights::sources::contain;
 use crate::tls::server::ServerTls;
 
 #[derive(Debug)]

@@ -5,3 +5,4 @@ pub mod peer_rights;
 pub mod policy;
 pub mod ranges;
 pub mod rule;
+pub(crate) mod sources;

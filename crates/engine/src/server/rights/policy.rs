@@ -10,6 +10,7 @@ use ipnet::IpNet;
 use crate::server::connections::peer::Peer;
 use crate::server::rights::peer_rights::PeerRights;
 use crate::server::rights::rule::Rule;
+use crate::server::rights::sources::match_peer;
 
 /// The rights of some peers.
 #[derive(Debug)]
@@ -40,24 +41,6 @@ impl<G> Grants<G> {
     pub(crate) fn by_certificate(&self, peer: &Peer) -> Result<Arc<G>, Arc<G>> {
         self.rights(peer.ip(), peer.role()).ok_or_else(|| Arc::clone(&self.nobody))
     }
-}
-
-/// Whether an entry with these sources and roles is for a peer.
-fn match_peer(
-    sources: &[IpNet],
-    roles: &Option<Vec<String>>,
-    peer: IpAddr,
-    role: Option<&str>,
-) -> bool {
-    let is_allowed =
-        |role| roles.as_ref().is_none_or(|roles| roles.iter().any(|each| each == role));
-    contain(sources, peer) && role.is_none_or(is_allowed)
-}
-
-/// Whether one of the networks has this address. An IPv4-mapped IPv6 address is treated as IPv4.
-pub(crate) fn contain(sources: &[IpNet], peer: IpAddr) -> bool {
-    let peer = peer.to_canonical();
-    sources.iter().any(|network| network.contains(&peer))
 }
 
 /// The rules of a Modbus listener. For each unit id, the first rule that names the peer and the unit
