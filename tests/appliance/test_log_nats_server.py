@@ -26,8 +26,10 @@ from holdfast.appliance import Appliance
 from holdfast.config import load
 from holdfast.net.nats_server import Access
 from holdfast.net.nats_server import folder as nats_folder
+from holdfast.net.nats_server import server as nats_server
 from holdfast.net.nats_server.folder import Folder as NatsFolder
 from holdfast.net.nats_server.log import ServerLog
+from holdfast.net.nats_server.storage_limit import has_room, may_grow
 from support import wire
 from support.brokers import free_port
 from support.cli import RunCommand, answer, done, invoke
@@ -130,13 +132,13 @@ def test_a_server_whose_disk_was_full_is_started_again_when_it_has_room(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = configuration(tmp_path, free_port(), more=", max_lag: 0.5")
-    has_room = threading.Event()
-    monkeypatch.setattr(NatsFolder, "has_room", lambda _: has_room.is_set())
+    is_freed = threading.Event()
+    monkeypatch.setattr(nats_server, "has_room", lambda _: is_freed.is_set())
     with Appliance(load(file)) as appliance, wire.Connection(endpoint(appliance, "scada")) as peer:
         resource.prlimit(server(tmp_path), resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
         wire.until(lambda: len(failed_writes(caplog)) > 1, "writes fail")
         assert is_server(appliance, {"running": True, "restarts": 0})
-        has_room.set()
+        is_freed.set()
         again = {"running": True, "restarts": 1}
         wire.until(lambda: is_server(appliance, again), "it is started again")
         wire.until(lambda: peer.ask(WRITE) == WRITE, "writes are taken again")
@@ -180,16 +182,19 @@ def test_a_server_may_store_no_less_after_a_restart(
         settings = json.loads(folder.configured(access).read_text())
         return int(settings["jetstream"]["max_file_store"]) >> 20
 
+    def grows() -> bool:
+        return may_grow(folder.store, folder.limit)
+
     monkeypatch.setattr(shutil, "disk_usage", free)
     assert limit() == 300
-    assert not folder.may_grow()
+    assert not grows()
     os.truncate(stored, 300 << 20)
-    assert folder.may_grow()
+    assert grows()
     assert limit() == 375
     os.truncate(stored, 375 << 20)
-    assert not folder.may_grow(), "a server that is full is not restarted again and again"
+    assert not grows(), "a server that is full is not restarted again and again"
     disk *= 2
-    assert folder.may_grow(), "there is room again"
+    assert grows(), "there is room again"
     folder.close()
 
 
@@ -199,16 +204,14 @@ def failed_writes(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 def test_a_folder_has_room_if_its_disk_takes_a_file(tmp_path: Path) -> None:
-    folder = NatsFolder(tmp_path / "log")
-    assert folder.has_room()
+    assert has_room(tmp_path)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
-        assert not folder.has_room()
+        assert not has_room(tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        folder.close()
-    assert not (folder.path / "room").exists()
+    assert not (tmp_path / "room").exists()
 
 
 def test_it_serves_this_machine_and_who_knows_the_token(file: Path, tmp_path: Path) -> None:

@@ -6,7 +6,6 @@ import errno
 import json
 import os
 import secrets
-import shutil
 import signal
 import sys
 import time
@@ -17,20 +16,11 @@ from typing import Any
 
 from holdfast.events.audit.lock import lock
 from holdfast.net.certificates.files import SECRET, replace
+from holdfast.net.nats_server.storage_limit import possible_limit
 from holdfast.net.secret_file import read_secret
 
 LEFT_OVER_END_TIMEOUT_S = 10.0
 """Seconds that a server which has lost its appliance has to end."""
-
-SHARE_OF_FREE_SPACE = 0.75
-"""How much of the free space of its disk the server may use: the default of nats-server. The rest
-is a reserve, from which a server that is full gets room for a snapshot."""
-
-MIN_GROWTH = 1.1
-"""A server that is full is restarted if it may then store so much more."""
-
-ROOM_BYTES = 2**20
-"""What a disk takes that is not full: the largest message of nats-server."""
 
 
 class ServerUnusable(OSError):
@@ -71,7 +61,10 @@ class Folder:
         self.path = path
         self.ended: int | None = None
         """The process id of a server that was left over."""
-        self._limit = 0
+        self.store = path / "store"
+        """Where the server stores its data."""
+        self.limit = 0
+        """How many bytes it may store, as it was configured last."""
         self._own = self._server = -1
         try:
             path.mkdir(mode=0o700, exist_ok=True)
@@ -93,29 +86,13 @@ class Folder:
         """Writes the server's configuration. Returns its file."""
         file = self.path / "nats-server.conf"
         try:
-            limit = self._possible_limit()
+            limit = possible_limit(self.store)
             settings = json.dumps(self._settings(access, limit), indent=2, ensure_ascii=False)
             replace(file, f"{settings}\n".encode(), SECRET)
-            self._limit = limit
+            self.limit = limit
         except OSError as error:
             raise _unusable(error.filename or file, error) from error
         return file
-
-    def may_grow(self) -> bool:
-        """Whether the server may store clearly more if it is configured anew."""
-        return self._possible_limit() >= self._limit * MIN_GROWTH
-
-    def has_room(self) -> bool:
-        """Whether the disk takes writes."""
-        file = self.path / "room"
-        try:
-            try:
-                file.write_bytes(bytes(ROOM_BYTES))
-            finally:
-                file.unlink(missing_ok=True)
-        except OSError:
-            return False
-        return True
 
     def close(self) -> None:
         """Unlocks the folder."""
@@ -145,25 +122,12 @@ class Folder:
             "port": access.port,
             # A confirmed write is on the disk, as there is no other server that has it.
             "jetstream": {
-                "store_dir": str(self.path / "store"),
+                "store_dir": str(self.store),
                 "sync_interval": "always",
                 "max_file_store": limit,
             },
             "authorization": self._authorization(access),
         }
-
-    def _possible_limit(self) -> int:
-        """How many bytes the server may store.
-
-        The default of nats-server is a share of the free space alone: each start would allow less.
-        """
-        stored = 0
-        for folder, _, files in os.walk(self.path / "store"):
-            for file in files:
-                with suppress(FileNotFoundError):
-                    stored += Path(folder, file).stat().st_size
-        free = shutil.disk_usage(self.path).free
-        return max(stored + int(free * SHARE_OF_FREE_SPACE), ROOM_BYTES)
 
     def _authorization(self, access: Access) -> dict[str, str]:
         if access.username is not None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.events import log_lines
 from holdfast.net.nats_server.folder import Folder, ServerUnusable, TemporarilyUnusable
 from holdfast.net.nats_server.log import ServerLog
+from holdfast.net.nats_server.storage_limit import has_room, may_grow
 from holdfast.runtime.backoff import PROVEN_S, Backoff
 from holdfast.runtime.child_process import ChildFailed, ChildProcess
 from holdfast.runtime.extras import DISTRIBUTION
@@ -101,7 +102,7 @@ class NatsServer:
         """
         assert self._folder is not None
         assert self._child is not None
-        if self._folder.has_room():
+        if has_room(self._folder.path):
             self._child.terminate()
 
     def _full(self) -> None:
@@ -112,7 +113,7 @@ class NatsServer:
         assert self._folder is not None
         assert self._child is not None
         with suppress(OSError):
-            if self._folder.may_grow():
+            if may_grow(self._folder.store, self._folder.limit):
                 self._folder.configured(self._access)
                 self._child.terminate()
 
