@@ -92,7 +92,7 @@ pub fn request<'py>(
     head: &RequestHead,
     body: Option<Bytes>,
 ) -> PyResult<Bound<'py, PyTuple>> {
-    let peer = peer::text(head.peer.address);
+    let peer = peer::text(&head.peer);
     let body = body.map(|body| PyBytes::new(py, &body));
     (exchange, known, peer, head.len, body, identity(&head.peer)).into_pyobject(py)
 }

@@ -120,7 +120,7 @@ impl ParsedWrites {
     fn lines<'py>(&self, py: Python<'py>, before: &[u8], after: &[u8]) -> Vec<Bound<'py, PyBytes>> {
         let writes = lock(&self.writes);
         let lines = writes.open.iter().map(|write| {
-            let peer = peer::text(write.head.peer.address);
+            let peer = peer::text(&write.head.peer);
             let origin = [before, b"\"", peer.as_bytes(), b"\"", after].concat();
             let lines = write.batch.records(&origin, &[&write.shown], "done", None);
             PyBytes::new(py, &lines.concat())

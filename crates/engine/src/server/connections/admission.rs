@@ -99,7 +99,7 @@ enum Crowd {
 impl Crowd {
     fn has(self, held: &Held) -> bool {
         match self {
-            Crowd::OfSource(source) => held.source() == source,
+            Crowd::OfSource(source) => held.peer.ip() == source,
             Crowd::All => true,
         }
     }
@@ -203,6 +203,7 @@ impl Admission {
         self: &Arc<Self>,
         peer: SocketAddr,
     ) -> Result<(Ticket, Option<Evicted>), Full> {
+        let peer = Peer::from(peer);
         let mut table = lock(&self.table);
         let max_handshakes = table.limits.max_handshakes;
         let evicted = match max_handshakes {
@@ -214,7 +215,7 @@ impl Admission {
         let admitted = self.since(Instant::now());
         let activity =
             Arc::new(Activity { last_request: AtomicU64::new(admitted), ..Activity::default() });
-        let (peer, opened) = (peer.into(), SystemTime::now());
+        let opened = SystemTime::now();
         let held = Held { peer, opened, admitted, activity: Arc::clone(&activity), task: None };
         match max_handshakes {
             None => table.insert_session(id, held),
@@ -284,7 +285,7 @@ impl Admission {
 impl Table {
     /// Makes sure that there is a place for a session.
     fn clear_session(&mut self, source: IpAddr, now: u64) -> Result<Option<Evicted>, Full> {
-        let Some(crowd) = self.crowd(source.to_canonical()) else {
+        let Some(crowd) = self.crowd(source) else {
             return Ok(None);
         };
         if let Some(id) = self.answered(crowd) {
@@ -315,7 +316,6 @@ impl Table {
     /// Makes sure that there is a place for a handshake. The oldest handshake gives way: one that
     /// takes its time is more likely a peer that never completes it.
     fn clear_handshake(&mut self, source: IpAddr, most: usize) -> Result<Option<Evicted>, Full> {
-        let source = source.to_canonical();
         let places = self.places(source);
         if let Some(crowd) = self.crowd(source)
             && self.limits.when_full == WhenFull::Refuse
@@ -380,12 +380,12 @@ impl Table {
     }
 
     fn insert_session(&mut self, id: u64, held: Held) {
-        self.per_source.entry(held.source()).or_default().sessions += 1;
+        self.per_source.entry(held.peer.ip()).or_default().sessions += 1;
         self.sessions.insert(id, held);
     }
 
     fn insert_handshake(&mut self, id: u64, held: Held) {
-        self.per_source.entry(held.source()).or_default().handshakes += 1;
+        self.per_source.entry(held.peer.ip()).or_default().handshakes += 1;
         self.handshakes.insert(id, held);
     }
 
@@ -393,14 +393,14 @@ impl Table {
         let session = self.sessions.remove(&id);
         let was_session = session.is_some();
         let held = session.or_else(|| self.handshakes.remove(&id))?;
-        let mut places = self.places(held.source());
+        let mut places = self.places(held.peer.ip());
         match was_session {
             true => places.sessions -= 1,
             false => places.handshakes -= 1,
         }
         match places.sessions + places.handshakes {
-            0 => self.per_source.remove(&held.source()),
-            _ => self.per_source.insert(held.source(), places),
+            0 => self.per_source.remove(&held.peer.ip()),
+            _ => self.per_source.insert(held.peer.ip(), places),
         };
         Some(held)
     }
@@ -456,10 +456,6 @@ impl Held {
     fn waited(&self, now: u64) -> u64 {
         now.saturating_sub(self.activity.last_request.load(Ordering::Relaxed))
     }
-
-    fn source(&self) -> IpAddr {
-        self.peer.ip().to_canonical()
-    }
 }
 
 impl Ticket {
@@ -474,7 +470,7 @@ impl Ticket {
     /// There is no place.
     pub(crate) fn establish(&self) -> Result<Option<Evicted>, Full> {
         let mut table = lock(&self.admission.table);
-        let Some(source) = table.handshakes.get(&self.id).map(Held::source) else {
+        let Some(source) = table.handshakes.get(&self.id).map(|held| held.peer.ip()) else {
             // It has just been evicted, and ends at the next await.
             return Ok(None);
         };

@@ -134,7 +134,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
         renewal: Arc<dyn Renewal>,
         ticket: Ticket,
     ) -> Connection<F, S> {
-        let share = Share::of(peer.ip());
+        let share = Share::of(&peer);
         let answering = Answering::new(context, peer, unit_server, rights);
         Connection {
             stream,
@@ -867,7 +867,7 @@ mod tests {
         let _guard = runtime.enter();
         let (mut connection, _bound) = connection::<Mbap>();
         connection.begin_with(&[0]);
-        let other = Share::of([192, 0, 2, 2].into());
+        let other = Share::of(&Peer::from(SocketAddr::from(([192, 0, 2, 2], 1))));
         connection.share.charge(1_000_000);
         let mut context = Context::from_waker(std::task::Waker::noop());
         assert!(connection.poll(&mut context).is_pending());

@@ -14,8 +14,9 @@ pub struct Peer {
 }
 
 impl Peer {
-    pub(crate) fn ip(&self) -> IpAddr {
-        self.address.ip()
+    /// The address without the port. An IPv4-mapped IPv6 address is given as IPv4.
+    pub fn ip(&self) -> IpAddr {
+        self.address.ip().to_canonical()
     }
 
     /// The role in its certificate; `None` without a certificate.

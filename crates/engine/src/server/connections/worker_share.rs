@@ -15,6 +15,8 @@ use std::task::{Context, Poll, Waker};
 
 use tokio::task::yield_now;
 
+use crate::server::connections::peer::Peer;
+
 /// The work of one source in a round. A read of a socket that brings one request is about a sixteenth of
 /// it: so much takes about 100 µs.
 const WORK_PER_ROUND: i64 = 1024;
@@ -78,8 +80,8 @@ pub(crate) struct Share {
 }
 
 impl Share {
-    pub(crate) fn of(peer: IpAddr) -> Share {
-        let place = WORKER.with_borrow_mut(|worker| worker.join(peer.to_canonical()));
+    pub(crate) fn of(peer: &Peer) -> Share {
+        let place = WORKER.with_borrow_mut(|worker| worker.join(peer.ip()));
         Share { place, number: None }
     }
 
@@ -277,6 +279,7 @@ impl Drop for End {
 
 #[cfg(test)]
 mod tests {
+    use std::net::SocketAddr;
     use std::sync::{Arc, Mutex};
 
     use proptest::prelude::*;
@@ -285,8 +288,8 @@ mod tests {
 
     use super::*;
 
-    fn address(last: u8) -> IpAddr {
-        IpAddr::from([192, 0, 2, last])
+    fn address(last: u8) -> Peer {
+        Peer::from(SocketAddr::from(([192, 0, 2, last], 1)))
     }
 
     /// The sources in the order in which they worked: the last byte of each address.
@@ -294,7 +297,7 @@ mod tests {
 
     /// A connection that never waits for its peer.
     fn flood(last: u8, steps: usize, work: u32, log: &Log) -> JoinHandle<()> {
-        let (log, mut share) = (Arc::clone(log), Share::of(address(last)));
+        let (log, mut share) = (Arc::clone(log), Share::of(&address(last)));
         tokio::spawn(async move {
             for _ in 0..steps {
                 share.come().await;
@@ -306,7 +309,7 @@ mod tests {
 
     /// A connection whose next request comes when the runtime has looked for input.
     fn polite(last: u8, steps: usize, log: &Log) -> JoinHandle<()> {
-        let (log, mut share) = (Arc::clone(log), Share::of(address(last)));
+        let (log, mut share) = (Arc::clone(log), Share::of(&address(last)));
         tokio::spawn(async move {
             for _ in 0..steps {
                 yield_now().await;
@@ -372,11 +375,11 @@ mod tests {
     fn connections_of_a_source_take_turns() {
         let runtime = Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
-            let _other = Share::of(address(2));
+            let _other = Share::of(&address(2));
             let order = Log::default();
             let mut tasks = JoinSet::new();
             for number in 0..8 {
-                let (order, mut share) = (Arc::clone(&order), Share::of(address(1)));
+                let (order, mut share) = (Arc::clone(&order), Share::of(&address(1)));
                 tasks.spawn(async move {
                     for _ in 0..10 {
                         share.come().await;
@@ -396,7 +399,7 @@ mod tests {
 
     #[test]
     fn a_source_that_is_alone_never_waits() {
-        let mut shares = [1, 1].map(|last| Share::of(address(last)));
+        let mut shares = [1, 1].map(|last| Share::of(&address(last)));
         let mut context = Context::from_waker(Waker::noop());
         for _ in 0..1000 {
             for share in &mut shares {
@@ -412,8 +415,8 @@ mod tests {
     fn nobody_waits_for_a_source_that_has_left() {
         let runtime = Builder::new_current_thread().enable_all().build().unwrap();
         runtime.block_on(async {
-            let other = Share::of(address(2));
-            let mut shares = [1; 3].map(|last| Share::of(address(last)));
+            let other = Share::of(&address(2));
+            let mut shares = [1; 3].map(|last| Share::of(&address(last)));
             shares[0].charge(100 * WORK_PER_ROUND as u32);
             let mut context = Context::from_waker(Waker::noop());
             assert!(shares.iter_mut().all(|share| share.poll(&mut context).is_pending()));
@@ -425,8 +428,8 @@ mod tests {
     #[test]
     fn work_above_a_share_is_paid_in_the_next_rounds() {
         let mut worker = Worker::default();
-        let place = worker.join(address(1));
-        worker.join(address(2));
+        let place = worker.join(address(1).ip());
+        worker.join(address(2).ip());
         worker.charge(place, 3 * WORK_PER_ROUND as u32 + 1);
         for left in [
             -2 * WORK_PER_ROUND - 1,
@@ -444,7 +447,8 @@ mod tests {
 
     #[test]
     fn ipv4_addresses_within_ipv6_are_the_same_source() {
-        let shares = ["192.0.2.1", "::ffff:192.0.2.1"].map(|ip| Share::of(ip.parse().unwrap()));
+        let shares = ["192.0.2.1:1", "[::ffff:192.0.2.1]:2"]
+            .map(|at| Share::of(&Peer::from(at.parse::<SocketAddr>().unwrap())));
         assert_eq!(shares[0].place, shares[1].place);
     }
 
@@ -458,7 +462,7 @@ mod tests {
             runtime.block_on(async {
                 let mut tasks = JoinSet::new();
                 for (last, steps, work, pauses, is_dropped) in connections {
-                    let mut share = Share::of(address(last));
+                    let mut share = Share::of(&address(last));
                     tasks.spawn(async move {
                         for _ in 0..steps {
                             share.come().await;

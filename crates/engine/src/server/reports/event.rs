@@ -233,7 +233,7 @@ impl Event {
     /// Where it comes from: an address, or the network /64 of an IPv6 address, because a host can
     /// use any address of it.
     fn source(&self) -> Option<IpAddr> {
-        Some(match self.peer.as_ref()?.ip().to_canonical() {
+        Some(match self.peer.as_ref()?.ip() {
             IpAddr::V6(whole) => {
                 IpAddr::V6(Ipv6Addr::from_bits(whole.to_bits() & (u128::MAX << 64)))
             }

@@ -273,7 +273,7 @@ impl RawIngest {
     ) -> Sending<S> {
         let mut bytes = Incoming::new(Arc::clone(&self.packets));
         bytes.extend(received);
-        let share = Share::of(peer.ip());
+        let share = Share::of(&peer);
         Sending { stream, peer, rights, bytes, unsent: Vec::new(), ticket, share }
     }
 
