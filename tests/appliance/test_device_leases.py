@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.appliance import Appliance
-from holdfast.appliance.nats_servers import nats_servers
+from holdfast.appliance.client_credentials import nats_servers
 from holdfast.appliance.parts import device_leases
 from holdfast.client.url import connection_of, parse
 from holdfast.config import ConfigError, load

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
-from holdfast.appliance.nats_servers import nats_servers
+from holdfast.appliance.client_credentials import nats_servers
 from holdfast.appliance.parts.part import Part
 from holdfast.client.url import connection_of
 from holdfast.events import log_lines

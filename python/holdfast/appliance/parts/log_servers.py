@@ -13,7 +13,7 @@ import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from holdfast.appliance.nats_servers import tls_files
+from holdfast.appliance.client_credentials import tls_files
 from holdfast.config.values.scanner_settings import parse_server
 from holdfast.config.values.urls import parse_http
 from holdfast.events import log_lines

@@ -6,7 +6,7 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from holdfast import _core
-from holdfast.appliance.nats_servers import tls_files
+from holdfast.appliance.client_credentials import tls_files
 from holdfast.appliance.parts.part import Part
 from holdfast.events import log_lines
 

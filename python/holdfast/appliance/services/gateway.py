@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.appliance.nats_servers import tls_files
+from holdfast.appliance.client_credentials import tls_files
 from holdfast.appliance.services.services import Service
 from holdfast.appliance.services.supervision import Supervisor
 from holdfast.client.endpoint import check_files

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, assert_never
 
-from holdfast.appliance.nats_servers import nats_servers
+from holdfast.appliance.client_credentials import nats_servers
 from holdfast.appliance.services.services import Service
 from holdfast.appliance.services.supervision import Supervisor
 from holdfast.config.models.outputs import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.appliance.nats_servers import nats_servers, tls_files
+from holdfast.appliance.client_credentials import nats_servers, tls_files
 from holdfast.appliance.services.services import Service
 from holdfast.appliance.services.supervision import Starter, Supervisor
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.appliance.nats_servers import nats_servers
+from holdfast.appliance.client_credentials import nats_servers
 from holdfast.appliance.parts import log_servers
 from holdfast.cli import SuggestingGroup
 from holdfast.cli.appliance.log_replay import replay

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast import _core
-from holdfast.appliance.nats_servers import nats_servers
+from holdfast.appliance.client_credentials import nats_servers
 from holdfast.appliance.parts import log_servers
 from holdfast.appliance.parts.memories import empty
 from holdfast.appliance.parts.shared_logs import credentials, servers

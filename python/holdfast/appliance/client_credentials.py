@@ -1,4 +1,4 @@
-"""The NATS servers of a configuration, and their credentials."""
+"""The credentials of clients: for the NATS servers of a configuration, and certificates."""
 
 from __future__ import annotations
 
