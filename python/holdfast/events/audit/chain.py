@@ -8,10 +8,11 @@ the `prev` of line 2. A chain goes on in the next file, and after a restart.
 from __future__ import annotations
 
 import hashlib
-import json
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
+
+from holdfast.events.audit.escaping import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -35,7 +36,7 @@ Record: TypeAlias = tuple[str, bytes]
 def unchained(record: Record) -> bytes:
     """The line without a place in the chain: for copies of lines that the file lacks."""
     time, body = record
-    return b'{"time":"%b","seq":null,"prev":null,%b\n' % (time.encode(), _plain(body)[1:])
+    return b'{"time":"%b","seq":null,"prev":null,%b\n' % (time.encode(), escaped(body)[1:])
 
 
 class End(NamedTuple):
@@ -52,26 +53,11 @@ def chained(end: End, records: Iterable[Record]) -> tuple[list[bytes], list[str]
     for time, body in records:
         seq += 1
         prev = "null" if digest is None else f'"{digest}"'
-        line = f'{{"time":"{time}","seq":{seq},"prev":{prev},'.encode() + _plain(body)[1:] + b"\n"
+        line = f'{{"time":"{time}","seq":{seq},"prev":{prev},'.encode() + escaped(body)[1:] + b"\n"
         digest = digest_of(line)
         lines.append(line)
         digests.append(digest)
     return lines, digests
-
-
-def _plain(body: bytes) -> bytes:
-    """JSON with invisible characters escaped, as they could forge what a terminal shows of a line.
-
-    JSON has them only in texts, and the encoders escape none above U+001F.
-    """
-    if body.isascii() and b"\x7f" not in body:
-        return body
-    letters = body.decode(errors="replace")
-    if letters.isprintable():
-        return body
-    return "".join(
-        letter if letter.isprintable() else json.dumps(letter)[1:-1] for letter in letters
-    ).encode()
 
 
 def digest_of(line: bytes) -> str:
