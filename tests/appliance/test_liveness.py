@@ -9,9 +9,10 @@ import pytest
 
 from holdfast import _core
 from holdfast.appliance import liveness
-from holdfast.appliance.liveness import STALLED_S, Liveness, cpu_time
+from holdfast.appliance.liveness import STALLED_S, Liveness
 from holdfast.appliance.services.supervision import Supervisor
 from holdfast.runtime.heartbeat import Heartbeat
+from holdfast.runtime.processor_time import cpu_time
 from support import wire
 
 if TYPE_CHECKING:

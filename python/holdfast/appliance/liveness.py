@@ -1,15 +1,13 @@
-"""Whether the threads of a running appliance still get to their work, and their processor time."""
+"""Whether the threads of a running appliance still get to their work."""
 
 from __future__ import annotations
 
 import logging
-import os
-import sys
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from holdfast.events import log_lines
+from holdfast.runtime.processor_time import cpu_time
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -70,16 +68,3 @@ class Liveness:
             thread: {"heartbeat_age": round(age, 3), "cpu": cpu_time(number)}
             for thread, age, number in self._heartbeats()
         }
-
-
-def cpu_time(number: int | None) -> float | None:
-    """Returns the processor time of a thread of this process; `None` where it is not known."""
-    if sys.platform != "linux":
-        return None
-    try:
-        stat = Path(f"/proc/self/task/{number}/stat").read_text()
-    except OSError:  # The thread has ended.
-        return None
-    # Behind the name in parentheses: the state, and 10 fields before utime and stime.
-    user, system = stat.rpartition(")")[2].split()[11:13]
-    return (int(user) + int(system)) / os.sysconf("SC_CLK_TCK")
