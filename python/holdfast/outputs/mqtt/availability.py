@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from math import inf
 from typing import TYPE_CHECKING
 
 from holdfast.outputs.mqtt.delivery import Message, packed_topic
@@ -14,6 +17,9 @@ if TYPE_CHECKING:
 
 ONLINE, OFFLINE = b"online", b"offline"
 
+MIN_REPEAT_INTERVAL_S = 1.0
+"""Seconds between two repetitions of `online`: another program may answer each with `offline`."""
+
 
 class Availability:
     """What was published of one output and its devices."""
@@ -24,10 +30,30 @@ class Availability:
         """Of each device, whether it answered when that was published last."""
         self._answers = -1
         """The number of answers of the site at which all was published."""
+        self._is_denied = threading.Event()
+        """Set if somebody else has published that this output is not online."""
+        self._repeated_at = -inf
 
     def of_output(self, payload: bytes) -> Message:
         """The message about the output itself; with `OFFLINE` it is also the will."""
         return Message(packed_topic(self._names.status), payload, self._retain)
+
+    def heard(self, payload: memoryview) -> None:
+        """Takes what was published of the output itself. Called by the thread of the connection.
+
+        Another output with this topic may have published it, or a late will of this output.
+        """
+        if payload != ONLINE:
+            self._is_denied.set()
+
+    def repeated(self) -> Message | None:
+        """`ONLINE` again, if somebody else has published that the output is not."""
+        now = time.monotonic()
+        if not self._is_denied.is_set() or now < self._repeated_at + MIN_REPEAT_INTERVAL_S:
+            return None
+        self._is_denied.clear()
+        self._repeated_at = now
+        return self.of_output(ONLINE)
 
     def begin(self) -> None:
         """Forgets what was published: a broker may have lost it."""

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
-from math import inf
 from typing import TYPE_CHECKING
 
 from holdfast.outputs.mqtt.availability import OFFLINE, ONLINE, Availability
@@ -26,10 +24,6 @@ if TYPE_CHECKING:
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
     from holdfast.tags import Tag
-
-
-MIN_DENIED_INTERVAL_S = 1.0
-"""Seconds between two repetitions of `online`: another program may answer each with `offline`."""
 
 
 class MqttOutput(BrokerReceiver):
@@ -56,9 +50,6 @@ class MqttOutput(BrokerReceiver):
         self._entities: dict[str, bytes] = {}
         self._found: deque[str] = deque()
         self._is_born = threading.Event()
-        self._is_denied = threading.Event()
-        """Set if somebody else has published that this output is not online."""
-        self._denied_at = -inf
         self._has_sent = True
         """Whether the broker has confirmed values since all were offered again."""
 
@@ -133,11 +124,8 @@ class MqttOutput(BrokerReceiver):
 
     def _keep_up(self, session: Session) -> None:
         """Publishes what has to be known before values."""
-        now = time.monotonic()
-        if self._is_denied.is_set() and now >= self._denied_at + MIN_DENIED_INTERVAL_S:
-            self._is_denied.clear()
-            self._denied_at = now
-            session.publish([self._availability.of_output(ONLINE)])
+        if repeated := self._availability.repeated():
+            session.publish([repeated])
         self._forget_removed()
         revision = self._site.revision
         if revision != self._revision:
@@ -241,9 +229,7 @@ class MqttOutput(BrokerReceiver):
         """Takes a message of the broker. Called by the thread of the connection."""
         session = self._session
         if message.topic == self._topics.status and not is_retained:
-            # As the will of another output with this topic, or a late one of this output.
-            if message.payload != ONLINE:
-                self._is_denied.set()
+            self._availability.heard(message.payload)
             return
         if session is None or self._commands.take(message, session, is_retained=is_retained):
             return
