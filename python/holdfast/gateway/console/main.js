@@ -7,7 +7,6 @@ import { Discovery } from "./discovery.js";
 import { Values } from "./values.js";
 
 const may = { write: null };
-const fields = ["host", "port", "unit", "transport", "timeout", "server"];
 /** Errors of the probe after which other areas may still respond. */
 const UNPROVEN = new Set(["timeout", "connection_lost", "invalid_reply", "exception"]);
 const PROBE = "It can't read holding register 0, but other areas may work";
@@ -61,13 +60,11 @@ async function begin() {
 
 /** Stores the device in the page's URL, so that it can be bookmarked and shared. */
 function remember() {
-  pageUrl.put(Object.fromEntries(fields.map((id) => [id, id === "server" && !target().serverName ? null : $(id).value.trim()])));
+  pageUrl.putDevice((id) => (id === "server" && !target().serverName ? null : $(id).value.trim()));
 }
 
 function recall() {
-  for (const [id, value] of pageUrl.given()) {
-    if (fields.includes(id)) $(id).value = value;
-  }
+  for (const [id, value] of pageUrl.view().device) $(id).value = value;
   $("server-label").hidden = !isSecure();
 }
 

@@ -1,7 +1,91 @@
 // The view in the page's URL, so that it can be bookmarked, shared and reloaded.
 
+import { typeOf } from "./numbers.js";
+import { list, range } from "./parts.js";
+import { areaOf, LAST_ADDRESS } from "./standard.js";
+
+/** The fields of the page that are parameters with the same names. */
+const DEVICE = ["host", "port", "unit", "transport", "timeout", "server"];
+const RANGE = ["area", "address", "quantity", "type", "size", "order", "letters", "interval"];
+
+const given = () => new URLSearchParams(location.hash.slice(1));
+
+/** Returns the view: the fields that it has with their values, its parts as spelled, and what is watched and plotted. */
+export function view() {
+  const query = given();
+  const fields = (ids) => ids.filter((id) => query.has(id)).map((id) => [id, query.get(id)]);
+  return {
+    device: fields(DEVICE),
+    range: fields(RANGE),
+    parts: query.getAll("part"),
+    watched: query.get("watch") === "1",
+    plotted: query.getAll("plot"),
+    span: query.get("span"),
+  };
+}
+
+/** Stores the device. `valueOf` returns the value of a field, or null for one that is left out. */
+export function putDevice(valueOf) {
+  put(Object.fromEntries(DEVICE.map((id) => [id, valueOf(id)])));
+}
+
+/** Stores everything but the device. `parts` are spelled, `span` may be null. */
+export function putValues(valueOf, { parts, watched, plotted, span }) {
+  const range = Object.fromEntries(RANGE.map((id) => [id, valueOf(id)]));
+  put({ ...range, part: parts, watch: watched ? "1" : null, plot: plotted, span });
+}
+
+/** Removes that the view is watched. */
+export const putStopped = () => put({ watch: null });
+
+/** Puts parameters into the page's URL, and removes those that are null. An array gives several. */
+function put(parameters) {
+  const query = given();
+  for (const [name, value] of Object.entries(parameters)) {
+    query.delete(name);
+    if (Array.isArray(value)) value.forEach((each) => query.append(name, each));
+    else if (value !== null) query.set(name, value);
+  }
+  history.replaceState(null, "", `#${query}`);
+}
+
+const spellings = new WeakMap();
+
+/** Returns a part for the link. It is spelled once: later changes of the view are in the link before a reload. */
+export function spelled(part) {
+  if (!spellings.has(part)) spellings.set(part, spell(part));
+  return spellings.get(part);
+}
+
+async function spell(part) {
+  if (part.kind === "range") {
+    const { area, address, quantity, type, order } = part;
+    return [area, address, quantity, type.name, order].join();
+  }
+  const { profile, tags, format } = part.source;
+  return profile ? `profile,${profile}` : `${format},${part.title},${await packed(tags)}`;
+}
+
+/** Returns the part that the link spells. Throws an error for one that can't be. */
+export async function readPart(text) {
+  const [first, ...rest] = text.split(",");
+  if (first === "profile") return list(rest.join(), { profile: rest.join() });
+  if (first === "yaml" || first === "csv") {
+    const tags = await unpacked(rest.pop());
+    return list(rest.join() || "Tags", { tags, format: first });
+  }
+  const [area, address, quantity] = [first, rest[0], rest[1]].map(Number);
+  const [kind, size] = (rest[2] ?? "").split(":");
+  const type = typeOf(kind, Number(size));
+  const whole = [area, address, quantity].every(Number.isInteger) && type.width > 0;
+  if (!whole || !areaOf(area) || address < 0 || quantity < 1 || address + quantity > LAST_ADDRESS + 1 || quantity > areaOf(area).most) {
+    throw new Error(`“${text}” is not a range`);
+  }
+  return range(area, address, quantity, type, rest[3] ?? "ABCD");
+}
+
 /** Returns text as a part of a URL: deflated, in base64url. */
-export async function packed(text) {
+async function packed(text) {
   const bytes = new Uint8Array(await new Response(
     new Blob([text]).stream().pipeThrough(new CompressionStream("deflate-raw")),
   ).arrayBuffer());
@@ -13,7 +97,7 @@ export async function packed(text) {
 const MAX_LENGTH = 65536;
 
 /** Returns the text of a part of a URL. Throws an error if it is damaged or too long. */
-export async function unpacked(part) {
+async function unpacked(part) {
   const binary = atob(part.replaceAll("-", "+").replaceAll("_", "/"));
   const bytes = Uint8Array.from(binary, (letter) => letter.charCodeAt(0));
   const reader = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate-raw"))
@@ -25,18 +109,4 @@ export async function unpacked(part) {
     text += value;
     if (text.length > MAX_LENGTH) throw new Error("the tag list of the link is too long");
   }
-}
-
-/** Returns the parameters of the page's URL. */
-export const given = () => new URLSearchParams(location.hash.slice(1));
-
-/** Puts parameters into the page's URL, and removes those that are null. An array gives several. */
-export function put(parameters) {
-  const query = given();
-  for (const [name, value] of Object.entries(parameters)) {
-    query.delete(name);
-    if (Array.isArray(value)) value.forEach((each) => query.append(name, each));
-    else if (value !== null) query.set(name, value);
-  }
-  history.replaceState(null, "", `#${query}`);
 }

@@ -1,8 +1,7 @@
-// The parts of a view: ranges and tag lists, for requests and for the link.
+// The parts of a view, ranges and tag lists: for requests, and described in words.
 
-import { packed, unpacked } from "./page_url.js";
-import { modicon, typeOf } from "./numbers.js";
-import { AREAS, areaOf, LAST_ADDRESS } from "./standard.js";
+import { modicon } from "./numbers.js";
+import { AREAS, areaOf } from "./standard.js";
 
 /** Returns a range. `type` is one of `typeOf`. */
 export function range(area, address, quantity, type, order) {
@@ -24,41 +23,6 @@ export function asked(part) {
   const { area, address, quantity, ofBits, type, order } = part;
   const typed = ofBits ? {} : { datatype: type.name, byteOrder: order };
   return { functionCode: area, address, quantity, ...typed };
-}
-
-const spellings = new WeakMap();
-
-/** Returns a part for the link. It is spelled once: later changes of the view are in the link before a reload. */
-export function spelled(part) {
-  if (!spellings.has(part)) spellings.set(part, spell(part));
-  return spellings.get(part);
-}
-
-async function spell(part) {
-  if (part.kind === "range") {
-    const { area, address, quantity, type, order } = part;
-    return [area, address, quantity, type.name, order].join();
-  }
-  const { profile, tags, format } = part.source;
-  return profile ? `profile,${profile}` : `${format},${part.title},${await packed(tags)}`;
-}
-
-/** Returns the part that the link spells. Throws an error for one that can't be. */
-export async function read(text) {
-  const [first, ...rest] = text.split(",");
-  if (first === "profile") return list(rest.join(), { profile: rest.join() });
-  if (first === "yaml" || first === "csv") {
-    const tags = await unpacked(rest.pop());
-    return list(rest.join() || "Tags", { tags, format: first });
-  }
-  const [area, address, quantity] = [first, rest[0], rest[1]].map(Number);
-  const [kind, size] = (rest[2] ?? "").split(":");
-  const type = typeOf(kind, Number(size));
-  const whole = [area, address, quantity].every(Number.isInteger) && type.width > 0;
-  if (!whole || !areaOf(area) || address < 0 || quantity < 1 || address + quantity > LAST_ADDRESS + 1 || quantity > areaOf(area).most) {
-    throw new Error(`“${text}” is not a range`);
-  }
-  return range(area, address, quantity, type, rest[3] ?? "ABCD");
 }
 
 /** Returns the read function of the area of a tag. */

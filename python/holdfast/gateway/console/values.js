@@ -22,7 +22,6 @@ const RESUME = 1000;
 const WRITTEN = { written: "Written", refused: "Not written", unknown: "Unknown whether it was written" };
 /** Errors after which a watch does not retry. */
 const FINAL = new Set(["malformed", "refused_target", "unauthorized", "foreign_page", "not_found"]);
-const FIELDS = ["area", "address", "quantity", "type", "size", "order", "letters", "interval"];
 const CSV = ["time", "part", "name", "area", "address", "type", "order", "value", "unit", "state", "error"];
 const CHECK = 1000;
 /** The most bytes of all parts: the body of a request has 64 KiB, with the device and the settings. */
@@ -72,36 +71,34 @@ export class Values {
 
   /** Fills in the view of the page's URL. Returns whether it is watched. */
   async recall() {
-    const query = pageUrl.given();
-    for (const id of FIELDS) {
-      const value = query.get(id);
-      if (value !== null && (!$(id).options || [...$(id).options].some((each) => each.value === value))) $(id).value = value;
+    const view = pageUrl.view();
+    for (const [id, value] of view.range) {
+      if (!$(id).options || [...$(id).options].some((each) => each.value === value)) $(id).value = value;
     }
     this.adapt();
-    for (const text of query.getAll("part")) {
+    for (const text of view.parts) {
       try {
-        this.pinned.push(await parts.read(text));
+        this.pinned.push(await pageUrl.readPart(text));
       } catch (error) {
         say($("outcome"), `A part of the link can't be used: ${error.message}.`);
       }
     }
     this.chips();
-    this.resumes = query.get("watch") === "1";
-    this.plotted = query.getAll("plot");
-    this.span = query.get("span");
+    this.resumes = view.watched;
+    this.plotted = view.plotted;
+    this.span = view.span;
     return this.resumes;
   }
 
   /** Stores the view in the page's URL. */
   async remember() {
     const pinned = this.pinned;
-    const spelled = await Promise.all(pinned.map(parts.spelled));
+    const spelled = await Promise.all(pinned.map(pageUrl.spelled));
     if (this.pinned !== pinned) return;
-    pageUrl.put({
-      ...Object.fromEntries(FIELDS.map((id) => [id, $(id).disabled ? null : $(id).value])),
-      part: spelled,
-      watch: this.watching ? "1" : null,
-      plot: this.plots?.keys() ?? this.plotted ?? [],
+    pageUrl.putValues((id) => ($(id).disabled ? null : $(id).value), {
+      parts: spelled,
+      watched: this.watching !== null,
+      plotted: this.plots?.keys() ?? this.plotted ?? [],
       span: this.plots ? String(this.plots.span) : this.span ?? null,
     });
   }
@@ -492,7 +489,7 @@ export class Values {
     this.plots?.stop();
     this.pressed(false);
     this.panels.forEach((panel) => panel.stale("No longer watched."));
-    pageUrl.put({ watch: null }); // At once: a reload now must not watch again.
+    pageUrl.putStopped(); // At once: a reload now must not watch again.
     this.remember();
     say($("outcome"), "Stopped.");
   }
