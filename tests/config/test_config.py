@@ -464,8 +464,8 @@ def test_a_forward_names_a_unit_or_a_memory(
 
 def test_devices_of_one_line_drive_it_alike(loaded: Callable[..., Config]) -> None:
     line = "url: 'rtu:///dev/ttyX?baud=9600', interval: 1"
-    reads = "forward: [{url: 'raw://a:1', unit: 1}], reads: [{area: coils, address: 0, count: 1}]"
-    both = f"a: {{unit: 1, {line}, {reads}}}, b: {{unit: 247, {line}, {reads}}}"
+    reads = "forward: [{url: 'raw://a:1', unit: 1}], reads: [{area: coils, address: %d, count: 1}]"
+    both = f"a: {{unit: 1, {line}, {reads % 0}}}, b: {{unit: 247, {line}, {reads % 1}}}"
     config = loaded(f"{SERVED}devices: {{{both}}}\n")
     assert config.warnings == ()
 

@@ -484,9 +484,37 @@ def test_a_block_of_a_receiver_has_one_device(folder: Folder) -> None:
     )
     read = "reads: [{area: coils, address: 0, count: 1}]"
     each = f"{{url: tcp://a, unit: 1, interval: 1, {read}, {block}}}"
-    text = f"devices:\n  a: {each}\n  b: {each.replace('A:1', 'a:1')}\n"
+    other = each.replace("A:1", "a:1").replace("address: 0", "address: 1")
+    text = f"devices:\n  a: {each}\n  b: {other}\n"
     assert folder.problems(text) == [
         "p.yaml:3: devices.b.forward[0].status: found input_registers 90 to 119 of unit 2 of a:1, "
         "which overlaps 90 to 119 of devices.a.forward[0].status in line 2, " + OWN
     ]
     assert folder.warnings(text.replace("slot: 3", "slot: 4", 1)) == []
+
+
+def test_an_address_of_a_receiver_has_one_source(folder: Folder) -> None:
+    def device(reads: str, forward: str = "{url: 'raw://a:1', unit: 1}") -> str:
+        return f"{{url: tcp://a, unit: 1, interval: 1, reads: [{reads}], forward: [{forward}]}}"
+
+    def into(memory: str) -> str:
+        return f"into: {{memory: {memory}, area: holding_registers, address: 50}}"
+
+    def read(address: int, more: str = "") -> str:
+        return f"{{area: holding_registers, address: {address}, count: 10{more}}}"
+
+    memories = "memories: {m: {holding_registers: 60}, n: {holding_registers: 60}}\n"
+    text = f"{memories}devices:\n  a: {device(read(0))}\n  b: {device(read(9))}\n"
+    assert folder.problems(text) == [
+        "p.yaml:4: devices.b.reads[0]: found holding_registers 9 to 18 of unit 1 of a:1, which "
+        f"overlaps 0 to 9 of devices.a.reads[0] in line 3, {OWN}"
+    ]
+    offset = "{url: 'raw://a:1', unit: 1, offsets: {holding_registers: 1}}"
+    assert folder.warnings(text.replace(device(read(9)), device(read(9), offset))) == []
+
+    both = f"{read(0, ', ' + into('m'))}, {read(20, ', ' + into('n'))}"
+    [problem] = folder.problems(f"{memories}devices:\n  a: {device(both)}\n")
+    assert problem.startswith("p.yaml:3: devices.a.reads[1]: found holding_registers 50 to 59")
+
+    same = f"{memories}devices:\n  a: {device(f'{read(0)}, {read(5)}')}\n"
+    assert folder.warnings(same) == []

@@ -43,12 +43,16 @@ _OF_POLLING = ("interval", "max_gap", "readable", "forbidden", "forward", "statu
 
 @dataclass(frozen=True)
 class Claim:
-    """Addresses of a memory that a read or status block writes; `path` is its place in the file."""
+    """Addresses of a memory that a read or status block writes; `path` is its place in the file.
+
+    Claims of one `source` that overlap are written with the same values.
+    """
 
     path: KeyPath
     memory: str
     area: Area
     addresses: range
+    source: tuple[KeyPath, Area, int] | None = None
 
     def __str__(self) -> str:
         return f"{self.area} {extent(self.addresses)} of {self.memory}"
@@ -107,6 +111,8 @@ class _Device:
                 self._target((*path, "status"), status, forward.format)
                 self._forwarded_status((*path, "status"), forward, status)
         with until_invalid():
+            self._forwarded_reads(forward)
+        with until_invalid():
             for area in forward.offsets.model_fields_set:
                 self._offset((*path, "offsets", area), area, getattr(forward.offsets, area))
 
@@ -123,11 +129,22 @@ class _Device:
         self, path: KeyPath, forward: ForwardConfig, status: ForwardedStatusConfig
     ) -> None:
         """Each block of a receiver has one device."""
-        target = status.unit if forward.format == "v1" else status.memory_id
-        if target is not None:
-            receiver = forward.receiver
-            of = f"{_NAMING[forward.format]} {target} of {joined(receiver.host, receiver.port)}"
-            self.claims.append(Claim(path, of, status.area, status.addresses))
+        memory = _memory_of(forward, status)
+        if memory is not None:
+            self.claims.append(Claim(path, memory, status.area, status.addresses))
+
+    def _forwarded_reads(self, forward: ForwardConfig) -> None:
+        """Each address of a receiver has one source."""
+        memory = _memory_of(forward, forward)
+        if memory is None:
+            return
+        for path, read in items((*self.path, "reads"), self.device.reads):
+            with until_invalid():
+                at = read.into or read
+                first = at.address + getattr(forward.offsets, at.area)
+                addresses = range(first, first + read.count)
+                source = (self.path, read.area, first - read.address)
+                self.claims.append(Claim(path, memory, at.area, addresses, source))
 
     def _offset(self, path: KeyPath, area: str, offset: int) -> None:
         """With its offset, every read is within the area of the receiver."""
@@ -204,15 +221,25 @@ class _Device:
         self.claims.append(Claim(path, status.memory, status.area, block))
 
 
+def _memory_of(forward: ForwardConfig, named: ForwardConfig | ForwardedStatusConfig) -> str | None:
+    """The memory of a receiver that packets name."""
+    target = named.unit if forward.format == "v1" else named.memory_id
+    if target is None:
+        return None
+    receiver = forward.receiver
+    return f"{_NAMING[forward.format]} {target} of {joined(receiver.host, receiver.port)}"
+
+
 def _check_overlaps(scope: Scope, claims: list[Claim]) -> None:
     """Reports reads and blocks that write an address twice, at the later one in the file."""
-    order = {claim.path: number for number, claim in enumerate(claims)}
+    order = {id(claim): number for number, claim in enumerate(claims)}
     widest: dict[tuple[str, str], Claim] = {}
     for claim in sorted(claims, key=lambda claim: claim.addresses.start):
         key = (claim.memory, claim.area)
         before = widest.setdefault(key, claim)
-        if before is not claim and claim.addresses.start < before.addresses.stop:
-            first, second = sorted((before, claim), key=lambda each: order[each.path])
+        is_same = before is claim or (claim.source is not None and claim.source == before.source)
+        if not is_same and claim.addresses.start < before.addresses.stop:
+            first, second = sorted((before, claim), key=lambda each: order[id(each)])
             overlapped = f"{extent(first.addresses)} of {scope.report.named(first.path)}"
             message = f"found {second}, which overlaps {overlapped}"
             scope.report.add(second.path, f"{message}, allowed: addresses without overlap")
