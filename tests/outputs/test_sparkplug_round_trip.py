@@ -65,7 +65,7 @@ def sent(node: EdgeNode, tag: Tag, metric: Any) -> tuple[list[list[int]], Comman
     commands = Commands("scada", "broker", site, node.find, writes=True)  # type: ignore[arg-type]
     data = Payload(metrics=[metric]).SerializeToString()
     message = Publish("topic", 0, 0, memoryview(data), len(data))
-    commands.take(message, "pump", is_retained=False)
+    commands.take(message, "pump")
     return site.written, commands
 
 

@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from holdfast.adapters.mqtt.inbox import Inbox
     from holdfast.net.mqtt.packets import Publish
 
-_RETAIN, _DUP = 0x01, 0x08
-"""Flags of PUBLISH."""
-
 _PUBACK, _PUBREC, _PUBCOMP = 0x40, 0x50, 0x70
 
 
@@ -62,7 +59,7 @@ class Deliveries:
             raise NotTaken(f"malformed message: {error}") from error
         if message.qos == 2 and message.identifier in self._unreleased:
             return Taken(acknowledgement(_PUBREC, message.identifier), message, None)
-        result = self._inbox.take(message, stale=_staleness(first))
+        result = self._inbox.take(message, stale=_staleness(message))
         if message.qos and result.get("reason") in KEEPING:
             raise NotTaken(result["detail"])
         sent = b""
@@ -82,13 +79,13 @@ class Deliveries:
         return acknowledgement(_PUBCOMP, identifier)
 
 
-def _staleness(first: int) -> str | None:
-    """Why a message may be old, by the first byte of its packet.
+def _staleness(message: Publish) -> str | None:
+    """Why a message may be old.
 
     `None` if nothing says so: what the broker has kept for a session looks like any new message.
     """
-    if first & _RETAIN:
+    if message.is_retained:
         return "the message is retained, so its command may be old"
-    if first & _DUP:
+    if message.is_repeated:
         return "the broker delivers the message again, and its command may be carried out already"
     return None

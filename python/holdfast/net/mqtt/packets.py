@@ -10,6 +10,9 @@ from typing import NamedTuple
 MAX_PROPERTIES_BYTES = 2**18
 """Bytes: enough for response topic, correlation data and content type of maximum length."""
 
+_RETAIN, _DUP = 0x01, 0x08
+"""Flags of PUBLISH."""
+
 _FIXED = {1: 1, 2: 4, 35: 2}
 """Properties of a fixed size, in bytes: payload format, message expiry, topic alias."""
 
@@ -65,6 +68,16 @@ class Publish(NamedTuple):
     correlation: bytes | None = None
     problem: str | None = None
     """Why the properties are malformed; `None` if they are valid."""
+    is_retained: bool = False
+    is_repeated: bool = False
+    """Whether the broker delivers it again (DUP), because it was not acknowledged."""
+
+    @property
+    def staleness(self) -> str | None:
+        """Why the message may be old; `None` if nothing says so."""
+        if self.is_retained:
+            return "retained"
+        return "delivered again" if self.is_repeated else None
 
 
 def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: bool) -> Publish:
@@ -102,6 +115,8 @@ def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: boo
         found.get(_RESPONSE_TOPIC),
         found.get(_CORRELATION_DATA),
         problem,
+        bool(flags & _RETAIN),
+        bool(flags & _DUP),
     )
 
 

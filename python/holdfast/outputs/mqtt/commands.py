@@ -33,8 +33,10 @@ END_TIMEOUT_S = 2.5
 
 
 class Commands(CommandOutcomes):
-    """The set topics of writable tags. A stale command must never be carried out: retained
-    messages are ignored, and the broker keeps no session.
+    """The set topics of writable tags. A stale command must never be carried out.
+
+    Retained messages are ignored. The broker keeps no session, so one that is delivered again was
+    delivered over this connection before.
     """
 
     def __init__(self, output: str, broker: str, names: TopicNames, site: Site) -> None:
@@ -66,7 +68,7 @@ class Commands(CommandOutcomes):
         }
         return list(self._tags)
 
-    def take(self, message: Publish, session: Session, *, is_retained: bool) -> bool:
+    def take(self, message: Publish, session: Session) -> bool:
         """Carries out a message, if its topic is one of a writable tag.
 
         A command for a device that another node polls is left to that node, without a reply.
@@ -74,8 +76,8 @@ class Commands(CommandOutcomes):
         found = self._tags.get(message.topic)
         if found is None:
             return False
-        if is_retained:
-            self.ignore(message.topic, "retained")
+        if message.staleness is not None:
+            self.ignore(message.topic, message.staleness)
         elif message.payload and found[0] not in self._site.standby:
             self._write(message, session, *found)
         return True

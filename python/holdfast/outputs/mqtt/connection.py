@@ -56,8 +56,8 @@ QUICK_ACK: int | None = getattr(socket, "TCP_QUICKACK", None)
 
 
 class Connection(BrokerClient):
-    """One connection. `on_command` is called for each message, with whether it was retained, and
-    `on_refused` for each one that the broker did not accept, and won't later, with the reason.
+    """One connection. `on_command` is called for each message, and `on_refused` for each one that
+    the broker did not accept, and won't later, with the reason.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Connection(BrokerClient):
         settings: BrokerConfig,
         client_id: str,
         waiter: Waiter,
-        on_command: Callable[[Publish, bool], None],
+        on_command: Callable[[Publish], None],
         on_refused: Callable[[Message, str], None],
         *,
         qos: int,
@@ -260,4 +260,4 @@ class Connection(BrokerClient):
             self.connection.put(acknowledgement(PUBACK, message.identifier))
         elif message.qos == 2:
             raise ValueError("a message with a quality of service that was not requested")
-        self._on_command(message, bool(first & 1))
+        self._on_command(message)

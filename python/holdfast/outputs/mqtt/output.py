@@ -225,18 +225,18 @@ class MqttOutput(BrokerReceiver):
         if changed := self._availability.changed(answering=answering):
             session.publish(changed)
 
-    def _on_message(self, message: Publish, is_retained: bool) -> None:
+    def _on_message(self, message: Publish) -> None:
         """Takes a message of the broker. Called by the thread of the connection."""
         session = self._session
-        if message.topic == self._topics.status and not is_retained:
+        if message.topic == self._topics.status and not message.is_retained:
             self._availability.heard(message.payload)
             return
-        if session is None or self._commands.take(message, session, is_retained=is_retained):
+        if session is None or self._commands.take(message, session):
             return
         if self._discovery is None:
             return
         if message.topic == self._discovery.birth_topic:
-            if message.payload == ONLINE and not is_retained:
+            if message.payload == ONLINE and not message.is_retained:
                 self._is_born.set()
-        elif is_retained and message.payload and self._discovery.owns(message.topic):
+        elif message.is_retained and message.payload and self._discovery.owns(message.topic):
             self._found.append(message.topic)

@@ -56,7 +56,7 @@ class Session:
         settings: BrokerConfig,
         client_id: str,
         will: Message | None,
-        on_command: Callable[[Publish, bool], None],
+        on_command: Callable[[Publish], None],
         on_refused: Callable[[Message, str], None],
         stop: Stop,
         *,
@@ -246,9 +246,9 @@ class Session:
             self._notify()
         connection.loop_misc()
 
-    def _take(self, message: Publish, is_retained: bool) -> None:
+    def _take(self, message: Publish) -> None:
         self._check()
-        self._on_command(message, is_retained)
+        self._on_command(message)
 
     def _check(self) -> None:
         """Raises `ConnectionError` after a standstill."""

@@ -39,14 +39,15 @@ class Commands(CommandOutcomes):
         self.rebirth = threading.Event()
         """Set when a host has requested a rebirth."""
 
-    def take(self, message: Publish, device: str | None, *, is_retained: bool) -> None:
+    def take(self, message: Publish, device: str | None) -> None:
         """Carries out a message for a device, or for the node.
 
-        A stale command must never be carried out, so retained messages are ignored.
+        A stale command must never be carried out: retained messages are ignored, and those that
+        are delivered again, which can only be over the same connection.
         """
         try:
-            if is_retained:
-                raise ValueError("retained")
+            if message.staleness is not None:
+                raise ValueError(message.staleness)
             if message.problem is not None:
                 raise ValueError(message.problem)
             for metric in parsed(bytes(message.payload)).metrics:

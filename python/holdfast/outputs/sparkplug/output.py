@@ -147,12 +147,12 @@ class SparkplugOutput(BrokerReceiver):
         if session is not None:
             session.close([self._node.death()], with_will=True)
 
-    def _on_message(self, message: Publish, is_retained: bool) -> None:
+    def _on_message(self, message: Publish) -> None:
         """Takes a message of the broker. Called by the thread of the connection."""
         if message.topic == self._names.of("NCMD"):
-            self._commands.take(message, None, is_retained=is_retained)
+            self._commands.take(message, None)
         elif (device := self._names.device_of(message.topic)) is not None:
-            self._commands.take(message, device, is_retained=is_retained)
+            self._commands.take(message, device)
         elif self._primary is not None:
             try:
                 self._primary.take(bytes(message.payload))

@@ -1,0 +1,91 @@
+"""Commands of outputs on the wire: which of those that a broker delivers are carried out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from holdfast.outputs.sparkplug.definition import Payload
+from support import mqtt_peer as mqtt
+from support import wire
+from support.mqtt_peer import FakeBroker, Peer
+from support.mqtt_plant import Plant
+from support.sparkplug_watch import SETTINGS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from support.mqtt_peer import Packet
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Iterator[Plant]:
+    with Plant(tmp_path) as started:
+        yield started
+
+
+@pytest.fixture(params=["5", "3.1.1"])
+def fake(request: pytest.FixtureRequest) -> Iterator[FakeBroker]:
+    with FakeBroker(request.param) as broker:
+        yield broker
+
+
+def until(peer: Peer, kind: int, part: bytes) -> Packet:
+    """Serves the output until it sends a packet of this type that contains `part`."""
+    while True:
+        packet = peer.receive()
+        match packet.kind:
+            case mqtt.CONNECT:
+                peer.connack()
+            case mqtt.SUBSCRIBE:
+                peer.suback(packet.identifier, 1)
+            case mqtt.PINGREQ:
+                peer.send(mqtt.packet(mqtt.PINGRESP))
+            case mqtt.PUBLISH if packet.flags & 2:
+                start = 2 + int.from_bytes(packet.body[:2])
+                identifier = int.from_bytes(packet.body[start : start + 2])
+                peer.send(mqtt.acknowledge(mqtt.PUBACK, identifier))
+        if packet.kind == kind and part in packet.body:
+            return packet
+
+
+def command(value: bool) -> bytes:
+    """The payload of a DCMD for the valve."""
+    made = Payload()
+    made.metrics.add(name="valve", datatype=11, boolean_value=value)
+    data: bytes = made.SerializeToString()
+    return data
+
+
+COMMANDS: dict[str, tuple[dict[str, Any], str, bytes]] = {
+    "set topic": ({}, "plant/pump/valve/set", b"true"),
+    "DCMD": (SETTINGS, "spBv1.0/plant/DCMD/edge/pump", command(True)),
+}
+"""The output, and the topic and the payload that open the valve."""
+
+
+@pytest.mark.parametrize("way", COMMANDS)
+def test_a_command_that_is_delivered_again_is_not_carried_out_again(
+    plant: Plant, fake: FakeBroker, way: str
+) -> None:
+    output, topic, payload = COMMANDS[way]
+    valve = plant.device().memory
+    plant.run(**output, writes=True, url=fake.url, version=fake.version)
+    with fake.accept() as peer:
+        until(peer, mqtt.SUBSCRIBE, topic.encode())
+        peer.send(mqtt.publish(topic, payload, 1, 7, version=fake.version))
+        until(peer, mqtt.PUBACK, b"\0\x07")
+        wire.until(lambda: valve.read("coils", 0, 1) == [1], "it is carried out")
+        valve.write("coils", 0, [0])
+        peer.send(mqtt.publish(topic, payload, 1, 7, version=fake.version, again=True))
+        until(peer, mqtt.PUBACK, b"\0\x07")
+
+        def ignored() -> bool:
+            status = plant.status()
+            counts = status.get("commands", status)
+            return 1 in (counts.get("ignored"), counts.get("commands_ignored"))
+
+        wire.until(ignored, "it is ignored")
+        assert valve.read("coils", 0, 1) == [0]
