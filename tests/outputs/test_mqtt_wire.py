@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import time
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from holdfast.outputs import sending
+from holdfast.outputs.mqtt import connection
 from holdfast.outputs.sparkplug.definition import Payload
 from support import mqtt_peer as mqtt
 from support import wire
@@ -18,6 +22,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from support.mqtt_peer import Packet
+
+
+@pytest.fixture(autouse=True)
+def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
+        monkeypatch.setattr(sending, name, 0.05)
 
 
 @pytest.fixture
@@ -89,3 +99,30 @@ def test_a_command_that_is_delivered_again_is_not_carried_out_again(
 
         wire.until(ignored, "it is ignored")
         assert valve.read("coils", 0, 1) == [0]
+
+
+def test_a_command_that_waited_while_the_network_stood_still_is_not_carried_out(
+    plant: Plant, fake: FakeBroker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "PING_INTERVAL_S", 0.05)
+    monkeypatch.setattr(connection, "MAX_COMMAND_AGE_S", 0.2)
+    valve = plant.device().memory
+    topic = "plant/pump/valve/set"
+    late = mqtt.publish(topic, "true", 1, 7, version=fake.version)
+    plant.run(writes=True, url=fake.url, version=fake.version)
+    with fake.accept() as peer:
+        until(peer, mqtt.SUBSCRIBE, topic.encode())
+        for _ in range(3):
+            until(peer, mqtt.PINGREQ, b"")
+        end = time.monotonic() + 0.2
+        wire.until(lambda: time.monotonic() > end, "no ping was answered for long enough")
+        peer.send(late)
+        peer.wait_until_closed()
+    wire.until(lambda: "late" in str(plant.status()["last_error"]), "the reason is reported")
+    monkeypatch.setattr(connection, "MAX_COMMAND_AGE_S", inf)
+    with fake.accept() as peer:
+        until(peer, mqtt.SUBSCRIBE, topic.encode())
+        peer.send(mqtt.publish(topic, "false", 1, 1, version=fake.version))
+        until(peer, mqtt.PUBLISH, b"accepted")
+    assert plant.status()["commands"]["written"] == 1
+    assert valve.read("coils", 0, 1) == [0]

@@ -2,7 +2,8 @@
 
 - Many messages are sent with one call, and many confirmations read with one.
 - A packet over the size limit is skipped.
-- paho does the rest: CONNECT, SUBSCRIBE, DISCONNECT, and pings while nothing is sent.
+- While commands are taken, pings find out how long one may have been on its way.
+- paho does the rest: CONNECT, SUBSCRIBE and DISCONNECT.
 
 All methods are for the thread that serves the connection.
 """
@@ -11,8 +12,10 @@ from __future__ import annotations
 
 import logging
 import socket
+import time
 from collections import deque
 from itertools import islice
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 from paho.mqtt.enums import MQTTErrorCode
@@ -49,6 +52,13 @@ MAX_TOPICS_PER_SUBSCRIBE = 100
 
 PUBLISH, PUBACK, PINGRESP = 0x30, 0x40, 0xD0
 _PING = bytes((0xC0, 0))
+
+PING_INTERVAL_S = 2.0
+"""Seconds between two pings while commands are taken."""
+
+MAX_COMMAND_AGE_S = 5.0
+"""Seconds that a command may have been on its way from the broker."""
+
 QUOTA_EXCEEDED = 0x97
 READ_BYTES = 262_144
 QUICK_ACK: int | None = getattr(socket, "TCP_QUICKACK", None)
@@ -69,14 +79,17 @@ class Connection(BrokerClient):
         on_refused: Callable[[Message, str], None],
         *,
         qos: int,
+        writes: bool,
         proves: bool,
     ) -> None:
-        """`proves`: with a quality of service of 0, messages count as confirmed when the broker
-        has answered a ping that follows them; otherwise, when they are written.
+        """`writes`: messages are commands, and one that may be late ends the connection.
+
+        `proves`: with a quality of service of 0, messages count as confirmed when the broker has
+        answered a ping that follows them; otherwise, when they are written.
         """
         super().__init__(settings, client_id, waiter, session_expiry=0)
         self._on_command, self._on_refused = on_command, on_refused
-        self._qos, self._proves = qos, proves
+        self._qos, self._writes, self._proves = qos, writes, proves
         self._max_in_flight = MAX_IN_FLIGHT[settings.version]
         self._largest: int | None = None
         self._retains = True
@@ -87,6 +100,10 @@ class Connection(BrokerClient):
         self._in_flight: dict[int, tuple[Delivery, int]] = {}
         self._written: list[Delivery] = []
         self._pinged: list[Delivery] = []
+        """What the answer to the ping that is on its way confirms."""
+        self._is_pinging = False
+        self._pinged_at = self._answered_at = 0.0
+        """When the last ping was sent, and when the last one that is answered was."""
         self._next = FIRST_IDENTIFIER
 
     def accepted(self, properties: Properties | None) -> None:
@@ -94,6 +111,7 @@ class Connection(BrokerClient):
         self._max_in_flight = min(
             getattr(properties, "ReceiveMaximum", self._max_in_flight), self._max_in_flight
         )
+        self._pinged_at = self._answered_at = time.monotonic()
         self._largest = getattr(properties, "MaximumPacketSize", None)
         self._retains = bool(getattr(properties, "RetainAvailable", 1))
         self._qos = min(getattr(properties, "MaximumQoS", self._qos), self._qos)
@@ -152,12 +170,40 @@ class Connection(BrokerClient):
             if delivery.sent == len(delivery.messages):
                 self._waiting.popleft()
         if self._written and self._proves:
-            if not self._pinged:
-                self._pinged, self._written = self._written, []
-                self.connection.put(_PING)
+            if not self._is_pinging:
+                self._ping()
         elif self._written and not self.connection.unsent:
             news = self._confirm(self._written)
         return news
+
+    def ping_if_due(self) -> None:
+        """Pings after the keep-alive time, and much more often while commands are taken. Ends the
+        connection if the broker does not answer within the keep-alive time.
+        """
+        if not self.is_accepted:
+            return
+        seconds = time.monotonic() - self._pinged_at
+        keep_alive = self.keepalive or inf  # The broker may have set it to 0, which is none.
+        if not self._is_pinging:
+            if seconds >= min(keep_alive, PING_INTERVAL_S if self._writes else inf):
+                self._ping()
+        elif seconds >= keep_alive:
+            self.end(f"the broker did not answer a ping within {keep_alive} s")
+
+    def _ping(self) -> None:
+        if self._proves:
+            self._pinged, self._written = self._written, []
+        self._pinged_at, self._is_pinging = time.monotonic(), True
+        self.connection.put(_PING)
+
+    def _check_age(self) -> None:
+        """Raises `ConnectionError` if what arrives may be late, because the network stood still.
+
+        The broker has sent it after it answered the last answered ping: it is no older than that.
+        """
+        age = time.monotonic() - self._answered_at
+        if age > MAX_COMMAND_AGE_S:
+            raise ConnectionError(f"a message may be {age:.0f} s late: no ping was answered since")
 
     @staticmethod
     def _confirm(deliveries: list[Delivery]) -> bool:
@@ -225,7 +271,8 @@ class Connection(BrokerClient):
                 news |= self._confirmed(body)
             elif first & 0xF0 == PUBLISH:
                 self._received(first, body)
-            elif first == PINGRESP and self._pinged:
+            elif first == PINGRESP and self._is_pinging:
+                self._is_pinging, self._answered_at = False, self._pinged_at
                 news |= self._confirm(self._pinged)
             elif self.pass_on(first, body) != MQTTErrorCode.MQTT_ERR_SUCCESS:
                 self.end(self.trouble or "the broker sent a malformed packet")
@@ -256,6 +303,8 @@ class Connection(BrokerClient):
 
     def _received(self, first: int, body: bytes | bytearray) -> None:
         message = parse_publish(first, body, len(body), five=self._five)
+        if self._writes and message.staleness is None:  # Others are never carried out.
+            self._check_age()
         if message.qos == 1:
             self.connection.put(acknowledgement(PUBACK, message.identifier))
         elif message.qos == 2:

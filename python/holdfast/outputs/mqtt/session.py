@@ -68,8 +68,8 @@ class Session:
         """`qos` is of all messages, and of the will unless it has its own. For `on_refused` and
         `proves`, see `Connection`.
 
-        With `writes`, messages are commands. If this process stood still, the connection ends, and
-        the broker drops the commands that waited: they are too late.
+        With `writes`, messages are commands. If this process or the network stood still, the
+        connection ends, and the broker drops the commands that waited: they are too late.
         """
         self._standstill = Standstill("output") if writes else None
         self._on_command, self._on_refused = on_command, on_refused
@@ -162,6 +162,7 @@ class Session:
                 self._take,
                 self._on_refused,
                 qos=self._qos,
+                writes=self._standstill is not None,
                 proves=self._proves,
             )
             connection.on_disconnect = self._on_disconnect
@@ -244,7 +245,7 @@ class Session:
             open_socket.flush()
         if (readable or pending) and connection.read_more():
             self._notify()
-        connection.loop_misc()
+        connection.ping_if_due()
 
     def _take(self, message: Publish) -> None:
         self._check()
