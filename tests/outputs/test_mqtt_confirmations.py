@@ -17,7 +17,6 @@ from holdfast.net.mqtt.packets import parse_publish
 from holdfast.net.mqtt.stream import Packets
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt import MqttOutput, session
-from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES
 from holdfast.runtime.stop import Stop
 from support import wire
 from support.mqtt_peer import CONNECT, DISCONNECT, PUBACK, PUBLISH, FakeBroker, Peer, acknowledge
@@ -29,6 +28,10 @@ if TYPE_CHECKING:
 
     from holdfast.polling import Reading
     from holdfast.tags import Tag
+
+
+LARGEST = 65_536
+"""Bytes: no packet of these tests has more."""
 
 
 class Broker:
@@ -55,7 +58,7 @@ class Broker:
                         pass
 
     def _serve(self, connection: socket.socket, most: int) -> None:
-        packets, confirmed = Packets(MAX_PACKET_BYTES), 0
+        packets, confirmed = Packets(LARGEST, LARGEST), 0
         seen: list[Any] = []
         self.seen.append(seen)
         while data := connection.recv(65536):

@@ -12,13 +12,16 @@ from holdfast.config.values.mqtt_output_topics import TopicNames
 from holdfast.net.mqtt.packets import parse_publish
 from holdfast.net.mqtt.selector import Waiter
 from holdfast.net.mqtt.stream import BrokerSocket, Packets
-from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES
 from holdfast.outputs.mqtt.delivery import Delivery, Message, packed, packed_topic
 from holdfast.runtime.stop import Stop
 from support.config_folder import Folder
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+
+LARGEST = 65_536
+"""Bytes: no packet of these tests has more."""
 
 
 def message(payload: bytes = b"1", *, retain: bool = False) -> Message:
@@ -30,7 +33,7 @@ def message(payload: bytes = b"1", *, retain: bool = False) -> Message:
 def test_what_is_sent_is_what_is_parsed(size: int, five: bool) -> None:
     sent = [message(bytes([at]) * size, retain=at == 1) for at in range(3)]
     data = packed(sent, [7, 8, 9], qos=1, five=five)
-    found = list(Packets(MAX_PACKET_BYTES).feed(data))
+    found = list(Packets(LARGEST, LARGEST).feed(data))
     assert [first & 1 for first, _, _ in found] == [0, 1, 0]
     parsed = [parse_publish(first, body, size, five=five) for first, body, size in found]
     assert [each.identifier for each in parsed] == [7, 8, 9]
@@ -42,26 +45,13 @@ def test_packets_are_found_in_pieces_of_any_size() -> None:
     chance = random.Random(7)
     sent = [message(bytes(chance.randrange(300))) for _ in range(50)]
     data = packed(sent, range(1, 51), qos=1, five=True)
-    whole = list(Packets(MAX_PACKET_BYTES).feed(data))
-    packets, found = Packets(MAX_PACKET_BYTES), []
+    whole = list(Packets(LARGEST, LARGEST).feed(data))
+    packets, found = Packets(LARGEST, LARGEST), []
     while data:
         size = chance.randrange(1, 40)
         found += list(packets.feed(data[:size]))
         data = data[size:]
     assert found == whole
-
-
-def test_a_packet_that_is_too_large_is_skipped_and_not_kept() -> None:
-    packets = Packets(MAX_PACKET_BYTES)
-    data = packed(
-        [message(bytes(10 * MAX_PACKET_BYTES)), message(b"next")], [1, 2], qos=1, five=True
-    )
-    found = []
-    for at in range(0, len(data), 1000):
-        found += list(packets.feed(data[at : at + 1000]))
-        assert len(packets._left) + len(packets._body) <= MAX_PACKET_BYTES
-    assert [body[-4:] for _, body, _ in found] == [b"next"]
-    assert packets.skipped == 1
 
 
 @pytest.mark.parametrize("piece", [1, 7, 1000, 2**20])
@@ -73,7 +63,7 @@ def test_a_packet_that_is_too_large_can_be_cut(piece: int) -> None:
     for at in range(0, len(data), piece):
         found += [(bytes(body), size) for _, body, size in packets.feed(data[at : at + piece])]
         assert len(packets._left) + len(packets._body) <= 1000
-    whole = [body for _, body, _ in Packets(MAX_PACKET_BYTES).feed(data)]
+    whole = [body for _, body, _ in Packets(LARGEST, LARGEST).feed(data)]
     cut = [whole[0], whole[1][:100], whole[2][:100], whole[3]]
     assert found == [(body, len(full)) for body, full in zip(cut, whole, strict=True)]
 
@@ -98,7 +88,7 @@ def test_packets_keep_their_order_while_the_broker_takes_little() -> None:
 
 def test_a_length_of_five_bytes_is_malformed() -> None:
     with pytest.raises(ValueError, match="more than 4 bytes"):
-        list(Packets(MAX_PACKET_BYTES).feed(b"\x30\xff\xff\xff\xff\x01"))
+        list(Packets(LARGEST, LARGEST).feed(b"\x30\xff\xff\xff\xff\x01"))
 
 
 def test_confirmations_count_without_a_gap() -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt import connection
+from holdfast.outputs.mqtt.connection import MAX_PAYLOAD_BYTES
 from holdfast.outputs.sparkplug.definition import Payload
 from support import mqtt_peer as mqtt
 from support import wire
@@ -126,3 +127,33 @@ def test_a_command_that_waited_while_the_network_stood_still_is_not_carried_out(
         until(peer, mqtt.PUBLISH, b"accepted")
     assert plant.status()["commands"]["written"] == 1
     assert valve.read("coils", 0, 1) == [0]
+
+
+@pytest.mark.parametrize("size", [MAX_PAYLOAD_BYTES + 1, 10 * MAX_PAYLOAD_BYTES])
+@pytest.mark.parametrize("way", COMMANDS)
+def test_a_command_that_is_too_large_is_acknowledged_and_refused(
+    plant: Plant,
+    fake: FakeBroker,
+    caplog: pytest.LogCaptureFixture,
+    way: str,
+    size: int,
+) -> None:
+    """A broker that gets no acknowledgement sends no more commands when enough of them lack."""
+    output, topic, payload = COMMANDS[way]
+    valve = plant.device().memory
+    plant.run(**output, writes=True, url=fake.url, version=fake.version)
+    with fake.accept() as peer:
+        until(peer, mqtt.SUBSCRIBE, topic.encode())
+        peer.send(mqtt.publish(topic, bytes(size), 1, 7, version=fake.version))
+        until(peer, mqtt.PUBACK, b"\0\x07")
+        if not output:
+            until(peer, mqtt.PUBLISH, b"too_large")
+        peer.send(mqtt.publish(topic, payload, 1, 8, version=fake.version))
+        until(peer, mqtt.PUBACK, b"\0\x08")
+        wire.until(lambda: valve.read("coils", 0, 1) == [1], "the next one is carried out")
+    logged = [
+        entry.fields["reason"]  # type: ignore[attr-defined]
+        for entry in caplog.records
+        if "output_command_" in entry.getMessage() and "written" not in entry.getMessage()
+    ]
+    assert logged in (["too_large"], [f"{size} bytes, allowed: {MAX_PAYLOAD_BYTES}"])

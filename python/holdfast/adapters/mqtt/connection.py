@@ -15,7 +15,7 @@ from holdfast.adapters.mqtt.deliveries import Deliveries, NotTaken
 from holdfast.adapters.mqtt.inbox import MAX_PAYLOAD_BYTES
 from holdfast.adapters.mqtt.sessions import SESSION_EXPIRY_S
 from holdfast.net.mqtt.client import BrokerClient
-from holdfast.net.mqtt.packets import MAX_PROPERTIES_BYTES
+from holdfast.net.mqtt.packets import MAX_HEAD_BYTES
 from holdfast.net.mqtt.stream import Packets
 
 if TYPE_CHECKING:
@@ -35,11 +35,6 @@ MAX_UNSENT_PACKETS = 1000
 
 _MAX_UNACKNOWLEDGED = 20
 """Limit of answers that are sent and not acknowledged; further answers wait."""
-
-_KEPT = MAX_PROPERTIES_BYTES + 2**17
-"""Bytes kept of a packet over the size limit: enough for everything before the payload."""
-
-_LARGEST = MAX_PAYLOAD_BYTES + _KEPT
 
 _READ_BYTES = 65_536
 
@@ -75,7 +70,7 @@ class BrokerConnection(BrokerClient):
         self._largest_sent: int | None = None
         self.most_qos = 1
         """The highest quality of service that the broker accepts, at most 1."""
-        self._packets = Packets(_LARGEST, _KEPT)
+        self._packets = Packets(MAX_PAYLOAD_BYTES + MAX_HEAD_BYTES, MAX_HEAD_BYTES)
         self._alive_at = time.monotonic()
         self._arrived: Iterator[tuple[int, bytes | bytearray, int]] = iter(())
         """What was read and is not handled yet."""

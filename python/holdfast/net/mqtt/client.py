@@ -101,16 +101,18 @@ class BrokerClient(Client):
         password = _password(settings.password_file)
         self.username_pw_set(settings.username, password)  # type: ignore[arg-type]
 
-    def open(self, **limits: int) -> None:
-        """Dials and sends CONNECT with these properties. Raises the exceptions of `dial`."""
+    def open(self) -> None:
+        """Dials and sends CONNECT. Raises the exceptions of `dial`.
+
+        Does not tell the broker the largest packet: Mosquitto 2.0 counts each message that it then
+        does not send as one on its way, until it sends none.
+        """
         settings = self._settings
         if not self._five:
             self.connect(settings.host, settings.port, settings.keep_alive)
             return
         properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
         properties.SessionExpiryInterval = self._expiry
-        for name, limit in limits.items():
-            setattr(properties, name, limit)
         self.connect(
             settings.host,
             settings.port,

@@ -10,6 +10,9 @@ from typing import NamedTuple
 MAX_PROPERTIES_BYTES = 2**18
 """Bytes: enough for response topic, correlation data and content type of maximum length."""
 
+MAX_HEAD_BYTES = MAX_PROPERTIES_BYTES + 2**17
+"""Bytes of a PUBLISH packet that are enough for everything before its payload."""
+
 _RETAIN, _DUP = 0x01, 0x08
 """Flags of PUBLISH."""
 

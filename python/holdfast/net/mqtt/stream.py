@@ -17,16 +17,14 @@ if TYPE_CHECKING:
 class Packets:
     """Packets from pieces of a byte stream."""
 
-    def __init__(self, most: int, kept: int = 0) -> None:
-        """Of a packet with more than `most` bytes, `kept` are kept; without them, it is skipped."""
+    def __init__(self, most: int, kept: int) -> None:
+        """Of a packet with more than `most` bytes, `kept` are kept."""
         self._most, self._kept = most, kept
         self._left = b""
         """The beginning of a packet, before its body."""
         self._first = self._size = self._missing = 0
         """Of a packet whose body is not complete: first byte, size, and bytes to come."""
         self._body = bytearray()
-        self.skipped = 0
-        """Packets that were too large."""
 
     def feed(self, data: bytes) -> Iterator[tuple[int, bytes | bytearray, int]]:
         """Yields the first byte, the body and the uncut size of each packet that is complete.
@@ -66,10 +64,7 @@ class Packets:
         if self._missing:
             return
         body, self._body = self._body, bytearray()
-        if self._size <= self._most or self._kept:
-            yield self._first, body, self._size
-        else:
-            self.skipped += 1
+        yield self._first, body, self._size
 
 
 class BrokerSocket:

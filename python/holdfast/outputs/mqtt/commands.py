@@ -12,6 +12,7 @@ from paho.mqtt.properties import Properties
 
 from holdfast.config.values.mqtt_output_topics import REPLY
 from holdfast.outputs.device_access import CommandOutcomes, NotWritten
+from holdfast.outputs.mqtt.connection import MAX_PAYLOAD_BYTES
 from holdfast.outputs.mqtt.delivery import NO_PROPERTIES, Message, packed_topic
 from holdfast.polling.faults import STANDBY, fault_word
 
@@ -92,6 +93,9 @@ class Commands(CommandOutcomes):
         with self._changed:
             self._waiting += 1
         try:
+            if message.size > MAX_PAYLOAD_BYTES:
+                detail = f"{message.size} bytes, allowed: {MAX_PAYLOAD_BYTES}"
+                raise NotWritten("too_large", detail)
             try:
                 text = bytes(message.payload).decode()
             except UnicodeDecodeError:

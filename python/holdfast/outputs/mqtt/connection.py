@@ -1,7 +1,7 @@
 """One connection to a broker, for many messages.
 
 - Many messages are sent with one call, and many confirmations read with one.
-- A packet over the size limit is skipped.
+- A packet over the size limit is not kept in memory while it arrives.
 - While commands are taken, pings find out how long one may have been on its way.
 - paho does the rest: CONNECT, SUBSCRIBE and DISCONNECT.
 
@@ -26,7 +26,7 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
 from holdfast.net.mqtt.client import BrokerClient
-from holdfast.net.mqtt.packets import acknowledgement, parse_publish
+from holdfast.net.mqtt.packets import MAX_HEAD_BYTES, acknowledgement, parse_publish
 from holdfast.net.mqtt.stream import Packets
 from holdfast.outputs.mqtt.delivery import MAX_IN_FLIGHT, Message, packed, size_of
 
@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 FIRST_IDENTIFIER, LAST_IDENTIFIER = 5000, 65535
 """Packet identifiers of messages. paho counts those of subscriptions from 1."""
 
-MAX_PACKET_BYTES = 65_536
-"""Bytes of a packet. A larger one is skipped: commands are short."""
+MAX_PAYLOAD_BYTES = 65_536
+"""Bytes of the payload of a command, which is short. One with more is refused."""
 
 MAX_TOPICS_PER_SUBSCRIBE = 100
 """Topics in one SUBSCRIBE packet."""
@@ -93,7 +93,7 @@ class Connection(BrokerClient):
         self._max_in_flight = MAX_IN_FLIGHT[settings.version]
         self._largest: int | None = None
         self._retains = True
-        self._packets = Packets(MAX_PACKET_BYTES)
+        self._packets = Packets(MAX_PAYLOAD_BYTES + MAX_HEAD_BYTES, MAX_HEAD_BYTES)
         self._subscribing: dict[int, Sequence[str]] = {}
         self.on_subscribe = self._on_subscribed
         self._waiting: deque[Delivery] = deque()
@@ -115,11 +115,6 @@ class Connection(BrokerClient):
         self._largest = getattr(properties, "MaximumPacketSize", None)
         self._retains = bool(getattr(properties, "RetainAvailable", 1))
         self._qos = min(getattr(properties, "MaximumQoS", self._qos), self._qos)
-
-    @property
-    def skipped(self) -> int:
-        """Packets of the broker that were too large."""
-        return self._packets.skipped
 
     def publish_all(self, delivery: Delivery) -> None:
         """Publishes messages after those that wait."""
@@ -266,11 +261,11 @@ class Connection(BrokerClient):
             # between them, which the system would send 40 ms later.
             connection.connection.setsockopt(socket.IPPROTO_TCP, QUICK_ACK, 1)
         news = False
-        for first, body, _ in self._packets.feed(data):
+        for first, body, size in self._packets.feed(data):
             if first == PUBACK:
                 news |= self._confirmed(body)
             elif first & 0xF0 == PUBLISH:
-                self._received(first, body)
+                self._received(first, body, size)
             elif first == PINGRESP and self._is_pinging:
                 self._is_pinging, self._answered_at = False, self._pinged_at
                 news |= self._confirm(self._pinged)
@@ -301,8 +296,8 @@ class Connection(BrokerClient):
         self._on_refused(delivery.messages[index], reason)
         delivery.confirm(index)
 
-    def _received(self, first: int, body: bytes | bytearray) -> None:
-        message = parse_publish(first, body, len(body), five=self._five)
+    def _received(self, first: int, body: bytes | bytearray, size: int) -> None:
+        message = parse_publish(first, body, size, five=self._five)
         if self._writes and message.staleness is None:  # Others are never carried out.
             self._check_age()
         if message.qos == 1:

@@ -16,7 +16,7 @@ from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S
 from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secure_channel import failure_text
 from holdfast.outputs import sending
-from holdfast.outputs.mqtt.connection import MAX_PACKET_BYTES, Connection
+from holdfast.outputs.mqtt.connection import Connection
 from holdfast.outputs.mqtt.delivery import Delivery, Message
 from holdfast.runtime.standstill import MAX_LOOK_INTERVAL_S, Standstill
 from holdfast.runtime.stop import Stop
@@ -171,7 +171,7 @@ class Session:
                     will.topic[2:].decode(), will.payload, self._will_qos, will.retain
                 )
             try:
-                connection.open(MaximumPacketSize=MAX_PACKET_BYTES)
+                connection.open()
                 end = time.monotonic() + CONNACK_TIMEOUT_S
                 while not connection.is_accepted and connection.is_open:
                     if time.monotonic() > end:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.outputs.device_access import CommandOutcomes, NotWritten
+from holdfast.outputs.mqtt.connection import MAX_PAYLOAD_BYTES
 from holdfast.outputs.sparkplug.datatypes import value_of
 from holdfast.outputs.sparkplug.definition import parsed
 from holdfast.outputs.sparkplug.node import REBIRTH
@@ -50,6 +51,8 @@ class Commands(CommandOutcomes):
                 raise ValueError(message.staleness)
             if message.problem is not None:
                 raise ValueError(message.problem)
+            if message.size > MAX_PAYLOAD_BYTES:
+                raise ValueError(f"{message.size} bytes, allowed: {MAX_PAYLOAD_BYTES}")
             for metric in parsed(bytes(message.payload)).metrics:
                 if device is None:
                     self._control(metric, message.topic)
