@@ -622,6 +622,31 @@ def test_commands_for_a_device_that_a_broker_keeps_are_a_warning(
 
 
 @pytest.mark.parametrize(
+    ("first", "second", "area", "warned"),
+    [
+        ("plant/commands", "plant/#", "holding_registers", True),
+        ("plant/#", "plant", "holding_registers", True),
+        ("plant/+/set", "plant/pump/+", "holding_registers", True),
+        ("$share/group/plant/set", "plant/+", "holding_registers", True),
+        ("plant/+", "plant", "holding_registers", False),
+        ("plant/+/set", "plant/pump/get", "holding_registers", False),
+        ("plant/commands", "plant/#", "coils", False),
+    ],
+)
+def test_filters_that_deliver_a_command_for_a_device_twice_are_a_warning(
+    folder: Folder, first: str, second: str, area: str, warned: bool
+) -> None:
+    entry = "    - {topic: '%s', qos: 0, memories: [plant], areas: [%s]}\n"
+    text = PASSED + "  subscriptions:\n" + entry % (first, area)
+    told = (
+        f"p.yaml:21: mqtt.subscriptions[1].topic: found '{second}', which overlaps '{first}': a "
+        "broker may deliver a message once for each of them, and its command is then sent to "
+        "drive twice"
+    )
+    assert folder.warnings(text + entry % (second, "coils")) == [told] * warned
+
+
+@pytest.mark.parametrize(
     ("address", "kind", "writes", "warned"),
     [
         (20, "uint16", "pass", True),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from paho.mqtt.matcher import MQTTMatcher
 
+from holdfast.config.values.topics import without_share
 from holdfast.events import log_lines
 from holdfast.events.throttle import Throttle
 from holdfast.ingest import Grant, Refused
@@ -167,17 +168,10 @@ class Filters:
         ]
         self._matcher = MQTTMatcher()  # type: ignore[no-untyped-call]
         for place, entry in reversed(list(enumerate(subscriptions))):
-            self._matcher[_without_share(entry.topic)] = place
+            self._matcher[without_share(entry.topic)] = place
 
     def grant(self, topic: str) -> Grant | None:
         """Returns the grant for messages of this topic; `None` when no filter matches."""
         places = self._matcher.iter_match(topic)  # type: ignore[no-untyped-call]
         first: int | None = min(places, default=None)
         return None if first is None else self._grants[first]
-
-
-def _without_share(topic: str) -> str:
-    """Returns the filter of a shared subscription, `$share/group/filter`; other filters as is."""
-    share, _, rest = topic.partition("/")
-    group, _, shared = rest.partition("/")
-    return shared if share == "$share" and group and shared else topic

@@ -19,6 +19,7 @@ from holdfast.config.models.listeners import RawRuleConfig
 from holdfast.config.models.services import AdapterConfig
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError
+from holdfast.config.values.topics import overlap
 from holdfast.runtime.text import extent, listing
 from holdfast.types import AREAS, BIT_AREAS
 
@@ -297,7 +298,8 @@ def _warn_of_late_messages(config: Config, report: Report) -> None:
 
 def _warn_of_passed(config: Config, report: Report) -> None:
     """Warns about messages of MQTT for ranges that are written through to devices: commands that
-    a broker keeps are late, and plain values are refused.
+    a broker keeps are late, those that two filters match may come twice, and plain values are
+    refused.
     """
     if config.mqtt is None:
         return
@@ -306,18 +308,28 @@ def _warn_of_passed(config: Config, report: Report) -> None:
         for name, device in config.devices.items()
         for read, into in device.passed
     ]
-    for index, topic in enumerate(config.mqtt.subscriptions):
+    subscriptions = config.mqtt.subscriptions
+    for index, topic in enumerate(subscriptions):
         names = dict.fromkeys(
             name
             for name, into, _ in passed
-            if topic.qos and into.memory in topic.memories and into.area in topic.areas
+            if into.memory in topic.memories and into.area in topic.areas
         )
-        if names:
+        if names and topic.qos:
             message = (
                 f"found {topic.qos}: commands that the broker keeps while there is no connection "
                 f"are sent to {listing(names)} afterwards, however old; with qos 0, it keeps none"
             )
             report.warn(("mqtt", "subscriptions", index, "qos"), message)
+        # The first filter that matches decides what a message may write.
+        for later in range(index + 1, len(subscriptions) if names else 0):
+            if overlap(topic.topic, subscriptions[later].topic):
+                message = (
+                    f"found {show(subscriptions[later].topic)}, which overlaps "
+                    f"{show(topic.topic)}: a broker may deliver a message once for each of them, "
+                    f"and its command is then sent to {listing(names)} twice"
+                )
+                report.warn(("mqtt", "subscriptions", later, "topic"), message)
     for index, (memory, tag) in enumerate(config.mapped().values()):
         for name, into, addresses in passed:
             is_there = (into.memory, into.area) == (memory, tag.area)

@@ -51,3 +51,22 @@ def parse_topic_template(text: object) -> str:
     if levels.count(DEVICE) != 1 or levels.count(TAG) > 1:
         raise ValueError(f"found {show(template)}, allowed: {DEVICE} once, {TAG} at most once")
     return template
+
+
+def without_share(topic: str) -> str:
+    """Returns the filter of a shared subscription, `$share/group/filter`; other filters as is."""
+    share, _, rest = topic.partition("/")
+    group, _, shared = rest.partition("/")
+    return shared if share == "$share" and group and shared else topic
+
+
+def overlap(one: str, other: str) -> bool:
+    """Whether a topic can match both filters."""
+    first, second = (without_share(each).split("/") for each in (one, other))
+    for level, against in zip(first, second, strict=False):
+        if "#" in (level, against):
+            return True
+        if level != against and "+" not in (level, against):
+            return False
+    # `a/#` matches `a` too.
+    return (first[len(second) :] or second[len(first) :]) in ([], ["#"])
