@@ -47,8 +47,8 @@ FIRST_IDENTIFIER, LAST_IDENTIFIER = 5000, 65535
 MAX_PAYLOAD_BYTES = 65_536
 """Bytes of the payload of a command, which is short. One with more is refused."""
 
-MAX_TOPICS_PER_SUBSCRIBE = 100
-"""Topics in one SUBSCRIBE packet."""
+MAX_TOPICS_PER_SUBSCRIBE = 8
+"""Topics in one SUBSCRIBE packet: AWS IoT Core ends connections that send more."""
 
 PUBLISH, PUBACK, PINGRESP = 0x30, 0x40, 0xD0
 _PING = bytes((0xC0, 0))

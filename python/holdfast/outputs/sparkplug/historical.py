@@ -29,5 +29,8 @@ class Births:
         return self._times.get(reading.tag.name) == reading.time
 
     def is_historical(self, reading: Reading) -> bool:
-        """Whether the birth had a newer one."""
-        return reading.time < self._times[reading.tag.name]
+        """Whether the birth had a newer one.
+
+        A birth that is in the future was before the clock was set back: nobody knows then.
+        """
+        return reading.time < self._times[reading.tag.name] <= time.time()

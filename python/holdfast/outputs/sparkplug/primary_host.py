@@ -31,11 +31,15 @@ class PrimaryHost:
         """Takes a STATE message. Raises `ValueError` for one that is malformed.
 
         A message that is older than the last one does not count: it is the will of a connection
-        that the host has replaced.
+        that the host has replaced. If it says that the host is online, that is an error too: the
+        clock of the host was set back.
         """
         online, timestamp = _parsed(payload)
         with self._changed:
             if self._since is not None and timestamp < self._since:
+                if online:
+                    older = (self._since - timestamp) / 1000
+                    raise ValueError(f"online, but {older:g} s older than the last STATE message")
                 return
             self._since, self.is_online, self._is_known = timestamp, online, True
             self._changed.notify_all()
