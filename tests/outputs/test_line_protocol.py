@@ -58,11 +58,15 @@ def test_floats_have_their_digits_and_wide_integers_are_floats() -> None:
         reading(7, tag=tag("n", type="uint64")),
         reading(None, tag=tag("m", type="uint64")),
         reading([1, 2**64 - 1, None], tag=tag("a", type="uint64[3]")),
+        reading(7, tag=tag("w", type="int64", scale=10)),
+        reading(7, tag=tag("o", type="int64", offset=-1)),
+        reading(7, tag=tag("i", type="int64", scale=-1, offset=-1)),
+        reading(7, tag=tag("k", type="uint32", scale=1000)),
         reading(7, tag=tag("p", type="int16", scale=RegisterScale("exponent", "sf"))),
         # It waited since its tag had another type.
         reading("on", tag=tag("s", type="uint64")),
     ]
-    fields = 'v=230.1,n=7.0,a[0]=1.0,a[1]=1.8446744073709552e+19,p=7.0,s="on"'
+    fields = 'v=230.1,n=7.0,a[0]=1.0,a[1]=1.8446744073709552e+19,w=7.0,o=7.0,i=7i,k=7i,p=7.0,s="on"'
     expected = f"modbus,device=pump {fields} {AT}\n"
     assert lines(readings, "modbus", {}).decode() == expected
 

@@ -151,7 +151,7 @@ class Buffer:
                 return
             try:
                 self.dropped += self.stored.add(rows)
-            except OSError:
+            except BaseException:
                 if rows[0] is not self._batch:
                     self._put_back(*rows)
                 raise

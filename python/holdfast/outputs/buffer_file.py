@@ -33,6 +33,9 @@ CREATE TABLE IF NOT EXISTS tags (meaning INTEGER PRIMARY KEY, description TEXT N
 """
 """`tags` is for readings whose tag is changed or removed before they are sent."""
 
+_DIGITS = 1
+"""The type of msgpack's extension for integers as text."""
+
 
 class Stored:
     """Readings in a file, oldest first. For one thread. Methods raise `OSError`.
@@ -81,7 +84,7 @@ class Stored:
             if meanings[of] not in self._described
         }
         encoded = [
-            msgspec.msgpack.encode(
+            _encoded(
                 [
                     (device, tag.name, value, time, fault, undecoded, meanings[id(tag)])
                     for device, tag, value, time, fault, undecoded in row
@@ -123,7 +126,7 @@ class Stored:
                 return found
             id, data, count = row
             try:
-                readings = [self._reading(*plain) for plain in msgspec.msgpack.decode(data)]
+                readings = [self._reading(*plain) for plain in _decoded(data)]
             except (msgspec.MsgspecError, TypeError, ValueError):
                 if found:
                     return found
@@ -187,6 +190,27 @@ class Stored:
         if row is None:
             return None
         return self._earlier.setdefault((name, meaning), tag_from(name, row[0]))
+
+
+def _encoded(plain: Sequence[tuple[Any, ...]]) -> bytes:
+    try:
+        return msgspec.msgpack.encode(plain)
+    except OverflowError:
+        # Integers of msgpack have 64 bits, and a scale makes longer ones: all are stored as text.
+        return msgspec.msgpack.encode(
+            [(device, name, _as_text(value), *rest) for device, name, value, *rest in plain]
+        )
+
+
+def _as_text(value: Any) -> Any:
+    """An integer, or each one of an array, as digits that `_decoded` knows from a text."""
+    if isinstance(value, list):
+        return [_as_text(item) for item in value]
+    return msgspec.msgpack.Ext(_DIGITS, b"%d" % value) if type(value) is int else value
+
+
+def _decoded(data: bytes) -> Any:
+    return msgspec.msgpack.decode(data, ext_hook=lambda _, digits: int(bytes(digits)))
 
 
 @contextlib.contextmanager

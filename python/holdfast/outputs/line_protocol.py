@@ -6,10 +6,12 @@ field.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-from holdfast.tags.scale import RegisterScale
+from holdfast.tags.scale import RegisterScale, linear_of
 from holdfast.tags.text import plain
+from holdfast.values.numeric import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -30,9 +32,11 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
     for device, tag, value, time, _, _ in readings:
         at = round(time * 1_000_000) * 1000
         fields = points.setdefault((device, at), [])
-        # A field has one kind. Some integers of this type do not fit, and whether a scale in a
-        # register makes a float depends on the register: all are floats.
-        is_float = tag.of_type.base == "uint64" or isinstance(tag.scale, RegisterScale)
+        # A field has one kind, and whether a scale in a register makes a float depends on the
+        # register: all are floats.
+        is_float = isinstance(tag.scale, RegisterScale) or (
+            tag.is_number and not tag.is_float and _is_wide(tag.of_type.base, tag.scale, tag.offset)
+        )
         shown = plain(tag, _as_float(value) if is_float else value)
         fields += [f"{key.translate(_KEY)}={written}" for key, written in _fields(tag.name, shown)]
     name = measurement.translate(_NAME)
@@ -42,6 +46,13 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
         for (device, at), fields in points.items()
         if fields
     ).encode()
+
+
+@lru_cache(1024)
+def _is_wide(base: str, scale: float, offset: float) -> bool:
+    """Whether some values of a type of integers do not fit the integers of the protocol."""
+    linear = linear_of(scale, offset)
+    return any(not MIN_INTEGER <= linear.value(end) <= MAX_INTEGER for end in limits(base))
 
 
 def _as_float(value: Any) -> Any:
