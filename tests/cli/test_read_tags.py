@@ -267,6 +267,25 @@ def test_a_recorded_text_is_played_back(
     assert playback.load(record, load_tags(file)) == {"t": [text, text]}
 
 
+def test_recorded_states_are_played_back_whatever_their_names(
+    server: holdfast.Server, memory: holdfast.Memory, tmp_path: Path
+) -> None:
+    memory.write("holding_registers", 0, [1, 2])
+    memory.write("coils", 0, [1])
+    file, record = tmp_path / "states.yaml", tmp_path / "values.csv"
+    file.write_text("""tags:
+  gear: {area: holding_registers, address: 0, states: {0: "1", 1: "2", 2: "3"}}
+  half: {area: holding_registers, address: 1, scale: 0.5, states: {0: "1", 1: "0.5"}}
+  valve: {area: coils, address: 0, states: {0: "true", 1: "false"}}
+""")
+    arguments = ("read", cli.url(server), "--tags", str(file), "--record", str(record))
+    assert invoke(*arguments).exit_code == 0
+    with record.open("a") as rows:
+        rows.write("later,0,0.5,false\n")
+    found = playback.load(record, load_tags(file))
+    assert found == {"gear": [1, 0], "half": [1, 0.5], "valve": [True, False]}
+
+
 @pytest.mark.parametrize("torn", ['2026,"A\n', '2026,"A""\nB', '2026,"A\nB"', "2026,A"], ids=ascii)
 @pytest.mark.parametrize("block", [1, 7, recording.BLOCK])
 def test_a_line_break_in_a_text_is_no_end_of_a_line(

@@ -309,6 +309,25 @@ def test_values_are_played_back_and_begin_again(tmp_path: Path) -> None:
     assert found == [[215, 1, 2, 1], [215, 3, 4, 0], [215, 1, 2, 1]]
 
 
+def test_a_state_is_played_back_by_its_name(tmp_path: Path) -> None:
+    tags = TagList(
+        [
+            Tag("mode", "holding_registers", 0, states={2: "off", 3: "eco"}),
+            Tag("relay", "coils", 0, states={0: "on", 1: "off"}),
+        ]
+    )
+    file = tmp_path / "values.csv"
+    file.write_text("mode,relay\neco,off\n2,on\n")
+    device = SimulatedDevice(tags, played=playback.load(file, tags))
+    found = []
+    for _ in range(2):
+        found.append(
+            (device.memory.read("holding_registers", 0, 1)[0], device.memory.read("coils", 0, 1)[0])
+        )
+        device.step()
+    assert found == [(3, 1), (2, 0)]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

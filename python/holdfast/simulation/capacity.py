@@ -24,10 +24,10 @@ def nearest(tag: Tag, value: Any) -> Any:
         value = empty.get(base)
         if value is None:
             return 0
+    if isinstance(value, str) and tag.states:
+        return tag.raw(value)
     if not tag.is_number:
         return value
-    if isinstance(value, str):
-        return tag.raw(value)
     least, most = _limits(tag)
     number = _linear(tag).number(value)
     if tag.is_float:
@@ -72,6 +72,8 @@ class Capacity:
 
     def _check_one(self, value: Any) -> None:
         tag = self._tag
+        if isinstance(value, str):
+            value = next((number for number, name in tag.states.items() if name == value), value)
         if not tag.is_number:
             try:
                 codec_for("holding_registers", tag.of_type.element, tag.order, tag.encoding).encode(
@@ -80,8 +82,6 @@ class Capacity:
             except ValueError as error:
                 raise DoesNotFit(f"{tag.name}: {error}") from None
             return
-        if isinstance(value, str):
-            value = next((number for number, name in tag.states.items() if name == value), value)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise DoesNotFit(f"{tag.name}: {value!r} is not a number")
         if not is_finite(value):

@@ -6,6 +6,7 @@ import csv
 from typing import TYPE_CHECKING, Any
 
 from holdfast.simulation.capacity import Capacity
+from holdfast.tags.strict_text import from_text
 from holdfast.tags.text import value_from
 from holdfast.values import DoesNotFit
 
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from holdfast.tags import TagList
+    from holdfast.tags import Tag, TagList
 
 MAX_ROWS = 1_000_000
 TIME = "time"
@@ -76,7 +77,7 @@ def _take(
             before.append(before[-1] if before else None)
             continue
         try:
-            value = value_from(tags[name], cell)
+            value = _value(tags[name], cell)
         except ValueError as error:
             raise Unplayable(f"{where}: {name}: {error}") from error
         before.append(value)
@@ -85,3 +86,13 @@ def _take(
                 capacities[name].check(value)
             except DoesNotFit as error:
                 raise Unplayable(f"{where}: {error}") from error
+
+
+def _value(tag: Tag, cell: str) -> Any:
+    """The value of a cell: a number before a state of that name, as states are recorded."""
+    try:
+        if tag.is_number:
+            return value_from(tag, cell, states=False)
+        return from_text(cell, tag.of_type, tag.type)
+    except ValueError:
+        return value_from(tag, cell)
