@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
+from holdfast import values
 from holdfast.client.tag_reading import TagReader
 from holdfast.errors import ModbusException
 from holdfast.simulation import generators, playback
@@ -309,6 +310,25 @@ def test_values_are_played_back_and_begin_again(tmp_path: Path) -> None:
     assert found == [[215, 1, 2, 1], [215, 3, 4, 0], [215, 1, 2, 1]]
 
 
+def test_infinity_is_played_back_and_null_in_an_array_repeats_its_item(tmp_path: Path) -> None:
+    tags = TagList(
+        [
+            Tag("flow", "input_registers", 0, "float32"),
+            Tag("loss", "input_registers", 2, "float32", scale=-0.5),
+            Tag("pair", "holding_registers", 0, "int16[2]", null=frozenset([-1])),
+        ]
+    )
+    file = tmp_path / "values.csv"
+    file.write_text('flow,loss,pair\n1.5,inf,"[1,null]"\n-inf,-1,"[null,2]"\n,,\n')
+    device = SimulatedDevice(tags, played=playback.load(file, tags))
+    found = []
+    for _ in range(3):
+        floats = values.decode(device.memory.read("input_registers", 0, 4), "float32[2]")
+        found.append([*floats, *device.memory.read("holding_registers", 0, 2)])
+        device.step()
+    assert found == [[1.5, -math.inf, 1, 0], [-math.inf, 2, 1, 2], [-math.inf, 2, 1, 2]]
+
+
 def test_a_state_is_played_back_by_its_name(tmp_path: Path) -> None:
     tags = TagList(
         [
@@ -339,6 +359,7 @@ def test_a_state_is_played_back_by_its_name(tmp_path: Path) -> None:
         ("time,t\n1\n", ":2: found 1 cells, allowed: 2"),
         ('t\n"1,5"\n', ":2: t: '1,5' has a decimal comma"),
         ("t\n1e999\n", ":2: t: '1e999' is not a finite number"),
+        ("t\ninf\n", ":2: t: 'inf' is not a number"),
         ("t\n1\n70000\n", r":3: t holds 0 to 65535 \(uint16\), found 70000; the nearest is 65535"),
     ],
 )
@@ -362,11 +383,21 @@ def test_a_cell_that_is_not_finite_is_refused_without_a_known_scale(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    "value", [math.inf, -math.inf, math.nan, 10**400], ids=["inf", "-inf", "nan", "too large"]
+    ("kind", "value"),
+    [
+        ("uint16", math.inf),
+        ("uint16", -math.inf),
+        ("uint16", math.nan),
+        ("uint16", 10**400),
+        ("float32", math.nan),
+        ("float32", 10**400),
+    ],
+    ids=lambda value: "too large" if value == 10**400 else None,
 )
-@pytest.mark.parametrize("kind", ["uint16", "float32"])
 @pytest.mark.parametrize("writable", [False, True])
-def test_numbers_that_are_not_finite_are_refused(kind: str, value: float, writable: bool) -> None:
+def test_numbers_that_registers_do_not_have_are_refused(
+    kind: str, value: float, writable: bool
+) -> None:
     tags = TagList([Tag("t", "holding_registers", 0, kind, writable=writable)])
     with pytest.raises(Refused, match=r"^t: .* is not a finite number$"):
         SimulatedDevice(tags, played={"t": [value]})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import TYPE_CHECKING, Any
 
 from holdfast.tags.scale import Linear, RegisterScale, is_finite
@@ -14,6 +15,8 @@ from holdfast.values.numeric import limits
 
 if TYPE_CHECKING:
     from holdfast.tags import Tag
+
+_INFINITE = (math.inf, -math.inf)
 
 
 def nearest(tag: Tag, value: Any) -> Any:
@@ -28,6 +31,8 @@ def nearest(tag: Tag, value: Any) -> Any:
         return tag.raw(value)
     if not tag.is_number:
         return value
+    if tag.is_float and value in _INFINITE:
+        return math.copysign(value, value * tag.scale)
     least, most = _limits(tag)
     number = _linear(tag).number(value)
     if tag.is_float:
@@ -56,11 +61,10 @@ class Capacity:
     def check(self, value: Any) -> None:
         """Raises `DoesNotFit` for a value that would become another one. Steps may round it.
 
-        `None` stands for an empty value, and a single value for all elements of an array.
+        `None` stands for an empty value, and a single value for all elements of an array. A float
+        can be infinite.
         """
         tag = self._tag
-        if value is None:
-            return
         if not isinstance(value, list):
             self._check_one(value)
             return
@@ -72,6 +76,8 @@ class Capacity:
 
     def _check_one(self, value: Any) -> None:
         tag = self._tag
+        if value is None:
+            return
         if isinstance(value, str):
             value = next((number for number, name in tag.states.items() if name == value), value)
         if not tag.is_number:
@@ -84,6 +90,8 @@ class Capacity:
             return
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise DoesNotFit(f"{tag.name}: {value!r} is not a number")
+        if tag.is_float and value in _INFINITE:
+            return
         if not is_finite(value):
             raise DoesNotFit(f"{tag.name}: {shown(value)} is not a finite number")
         if not tag.null and self._least <= value <= self._most:

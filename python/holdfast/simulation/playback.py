@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from itertools import chain, repeat
 from typing import TYPE_CHECKING, Any
 
 from holdfast.simulation.capacity import Capacity
@@ -20,13 +21,17 @@ MAX_ROWS = 1_000_000
 TIME = "time"
 """The column that is ignored: each row is one step."""
 
+_INFINITIES = ("inf", "-inf")
+"""How infinite values of registers are recorded. No write takes them."""
+
 
 class Unplayable(ValueError):
     """The file can't be played back."""
 
 
 def load(path: Path, tags: TagList) -> dict[str, list[Any]]:
-    """Reads the values of each tag. An empty cell repeats the value before.
+    """Reads the values of each tag. An empty cell repeats the value before, as does a null
+    in an array for its item.
 
     Raises `Unplayable`, which names file and line, and `OSError`.
     """
@@ -80,6 +85,9 @@ def _take(
             value = _value(tags[name], cell)
         except ValueError as error:
             raise Unplayable(f"{where}: {name}: {error}") from error
+        if isinstance(value, list):
+            items = chain((before[-1] if before else None) or (), repeat(None))
+            value = [was if item is None else item for item, was in zip(value, items, strict=False)]
         before.append(value)
         if name in capacities:
             try:
@@ -91,6 +99,8 @@ def _take(
 def _value(tag: Tag, cell: str) -> Any:
     """The value of a cell: a number before a state of that name, as states are recorded."""
     try:
+        if tag.is_float and cell in _INFINITIES:
+            return float(cell)
         if tag.is_number:
             return value_from(tag, cell, states=False)
         return from_text(cell, tag.of_type, tag.type)
