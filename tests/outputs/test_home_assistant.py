@@ -128,6 +128,8 @@ def test_no_two_tags_have_one_id() -> None:
         (tag(), None, "None"),
         (tag(type="uint16", states=STATES), 1, "it's on"),
         (tag(type="uint16", states=STATES), 7, "None"),
+        (tag(type="uint16", scale=0.5, states=STATES), 1.0, "it's on"),
+        (tag(type="uint16", scale=0.5, states=STATES), 0.5, "None"),
         (tag(type="uint16", states=STATES), None, "None"),
         (tag(area="coils", type="bool"), True, "true"),
         (tag(area="coils", type="bool"), False, "false"),

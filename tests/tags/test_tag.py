@@ -198,7 +198,10 @@ def test_states_have_names_both_ways() -> None:
     it = tag(states={0: "off", 1: "running"})
     assert [it.state(it.value(raw)) for raw in (0, 1, 2)] == ["off", "running", None]
     assert (it.raw("running"), it.raw(1)) == (1, 1)
-    assert (it.state(1.0), it.state([1])) == (None, None)
+    assert (it.state(None), it.state("1"), it.state([1])) == (None, None, None)
+    half = tag(scale=0.5, states={0: "off", 1: "running"})
+    assert [half.state(half.value(raw)) for raw in (0, 1, 2)] == ["off", None, "running"]
+    assert half.raw("running") == 2
 
 
 def test_markers_and_nan_are_no_values() -> None:

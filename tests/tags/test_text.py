@@ -49,6 +49,8 @@ def float32(number: float) -> float:
         (tag("uint64"), 2**64 - 1, str(2**64 - 1), 2**64 - 1),
         (tag(states={0: "off", 2: "fault"}), 2, "fault", 2),
         (tag(states={0: "off"}), 7, "7", 7),
+        (tag(scale=0.5, states={1: "on"}), 2, "on", 1.0),
+        (tag(scale=0.5, states={1: "on"}), 1, "0.5", 0.5),
         (tag("int16", scale=0.000125), 8, "0.001000", 0.001),
         (tag("int16", scale=0.0001251), 10, "0.001251", 0.001251),
         (tag("float32", offset=-1), float32(1.1), "0.1", 0.1),

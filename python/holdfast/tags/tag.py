@@ -221,8 +221,8 @@ class Tag(WritableTag):
         return linear.value(raw)
 
     def state(self, value: Any) -> str | None:
-        """The name of a value, if it has one."""
-        return self.states.get(value) if isinstance(value, int) else None
+        """The name of a value, if it has one. With a scale of 0.5, 1.0 has that of 1."""
+        return None if isinstance(value, list) else self.states.get(value)
 
 
 _KEYS = {UnknownOrder: "order", UnknownEncoding: "encoding"}
