@@ -218,7 +218,8 @@ class Tag(WritableTag):
             return None
         if linear.is_identity:
             return float(raw) if isinstance(raw, Fraction) else raw
-        return linear.value(raw)
+        # The digits of a float32 are found when it is shown: see `holdfast.tags.text`.
+        return linear.value(self._as_written(raw) if self.of_type.base == "float64" else raw)
 
     def state(self, value: Any) -> str | None:
         """The name of a value, if it has one. With a scale of 0.5, 1.0 has that of 1."""
