@@ -6,6 +6,7 @@ import contextlib
 import math
 import struct
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
@@ -103,6 +104,15 @@ def test_a_scale_in_a_register_makes_any_number_a_double() -> None:
     scale = RegisterScale("exponent", source=Tag("", "holding_registers", 1, "int16"))
     datatype, _ = datatype_of(Tag("x", "holding_registers", 0, "uint16", scale=scale))
     assert (datatype.name, datatype.packed(4320)) == ("Double", 4320.0)
+
+
+def test_a_scaled_float_has_its_digits_in_a_double() -> None:
+    tag = Tag("x", "holding_registers", 0, "float32", scale=10)
+    datatype, _ = datatype_of(tag)
+    assert datatype.packed(tag.value(230.10000610351562)) == 2301
+    assert datatype.packed(tag.value(math.inf)) == math.inf
+    many, _ = datatype_of(replace(tag, type="float32[2]"))
+    assert value_of(Metric(bytes_value=many.packed([2301.0000610351562, None])), many)[0] == 2301
 
 
 TAGS = [

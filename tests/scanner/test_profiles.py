@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from holdfast.tags import Tag, TagList
 from holdfast.tags.scale import RegisterScale
+from holdfast.values import encode
 from support import wire
 from support.nats_bus import leaving, subscription, tag
 
@@ -21,6 +23,8 @@ PROFILE = TagList(
         Tag("setpoint", "holding_registers", 1, scale=0.1, writable=True, min=5, max=30),
         Tag("mode", "holding_registers", 2, states={0: "off", 1: "eco"}, writable=True),
         Tag("open", "coils", 3),
+        Tag("flow", "holding_registers", 4, "float32"),
+        Tag("flows", "holding_registers", 4, "float32[2]", scale=0.1),
     ]
 )
 METER = TagList(
@@ -55,13 +59,17 @@ def test_the_values_of_a_profile_are_scaled(
     caller: Caller, server: holdfast.Server, memory: holdfast.Memory
 ) -> None:
     memory.write("holding_registers", 0, [215, 175, 1])
+    memory.write("holding_registers", 4, encode([230.1, math.inf], "float32[2]"))
     data = caller.listen("modbus.data.plc1")
     request = subscription(server, tag("raw", 0), profile="heater")
-    assert caller.request("modbus.subscribe", request) == {"success": True, "count": 5}
-    values = {"raw": 215, "water": 21.5, "setpoint": 17.5, "mode": 1, "open": False}
-    assert first(data, 5) == values
+    request["tags"].append(tag("raw_flow", 4, datatype="float32"))
+    assert caller.request("modbus.subscribe", request) == {"success": True, "count": 8}
+    values: dict[str, Any] = {"raw": 215, "water": 21.5, "setpoint": 17.5, "mode": 1, "open": False}
+    # A tag with a meaning has the digits of its type, any other is the number in the registers.
+    values |= {"flow": 230.1, "flows": [23.01, None], "raw_flow": 230.10000610351562}
+    assert first(data, 8) == values
     memory.write("holding_registers", 0, [65535])
-    wire.until(lambda: first(data, 5)["water"] is None, "the marker is no value")
+    wire.until(lambda: first(data, 8)["water"] is None, "the marker is no value")
     [device] = caller.request("modbus.browse", b"")["devices"]
     shown = {each["id"]: (each.get("profile"), each.get("unit")) for each in device["tags"]}
     assert shown["water"] == ("heater", "°C")

@@ -7,6 +7,7 @@ import struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast.protocol import READ_LIMITS
+from holdfast.tags.text import plain
 from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
@@ -80,11 +81,22 @@ def datatype_of(tag: Tag) -> tuple[Datatype, bool]:
     number = _OF_TAG[tag.of_type.base]
     if tag.is_number and (tag.scale, tag.offset) != (1, 0):
         number = DOUBLE
-    base, is_array = _BASES[number], tag.of_type.count is not None
-    if is_array and base.array is not None and (not tag.null or number in (FLOAT, DOUBLE)):
-        packer = _packer(base.array)
-        return Datatype(base.array, f"{base.name}Array", "bytes_value", packer), False
-    return Datatype(number, base.name, base.field, _single(number)), is_array
+    base, by_item = _BASES[number], tag.of_type.count is not None
+    made = Datatype(number, base.name, base.field, _single(number))
+    if by_item and base.array is not None and (not tag.null or number in (FLOAT, DOUBLE)):
+        made = Datatype(base.array, f"{base.name}Array", "bytes_value", _packer(base.array))
+        by_item = False
+    if number == DOUBLE and tag.of_type.base == "float32":
+        packed = made.packed
+        made = made._replace(packed=lambda value: packed(_with_digits(tag, value)))
+    return made, by_item
+
+
+def _with_digits(tag: Tag, value: Any) -> Any:
+    """A scaled `float32` as it is shown: a Double has digits that its registers do not have."""
+    if isinstance(value, list):
+        return [_with_digits(tag, item) for item in value]
+    return value if value is None or math.isinf(value) else plain(tag, value)
 
 
 def _single(number: int) -> Callable[[Any], Any]:

@@ -9,6 +9,7 @@ from holdfast import tags
 from holdfast.scanner.messages.types import FunctionCode
 from holdfast.tags.base import BaseTag, Scaled
 from holdfast.tags.decoding import Undecoded
+from holdfast.tags.text import plain
 from holdfast.types import AREAS
 from holdfast.values.types import parsed
 
@@ -54,11 +55,14 @@ class Tag(BaseTag):
         return None if self.meaning is None else self.meaning.source
 
     def value(self, raw: Any) -> Any:
-        """The value of what the registers hold; `None` if none is available."""
+        """The value of what the registers hold; `None` if none is available.
+
+        That of a profile is as outputs publish it, with the digits of its type.
+        """
         if type(raw) is Undecoded:
             return raw
         if self.meaning is not None:
-            return self.meaning.value(raw)
+            return plain(self.meaning, self.meaning.value(raw))
         if type(raw) is list:
             return [None if self.is_null(item) else item for item in raw]
         return None if self.is_null(raw) else raw
