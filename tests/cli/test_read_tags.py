@@ -267,6 +267,18 @@ def test_a_recorded_text_is_played_back(
     assert playback.load(record, load_tags(file)) == {"t": [text, text]}
 
 
+def test_an_item_has_the_form_that_write_takes(
+    server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    words = values.encode(b"\x01\xf0\xff", "bytes:3")
+    memory.write("holding_registers", 0, words)
+    found = answer("read", cli.url(server), "hr:0:bytes:3", "hr:0:bytes:2")["values"]
+    assert found == {"hr:0:bytes:3": "01f0ff", "hr:0:bytes:2": "01f0"}
+    memory.write("holding_registers", 0, [0, 0])
+    done("write", cli.url(server), "hr:0:bytes:3", found["hr:0:bytes:3"])
+    assert memory.read("holding_registers", 0, 2) == words
+
+
 def test_recorded_states_are_played_back_whatever_their_names(
     server: holdfast.Server, memory: holdfast.Memory, tmp_path: Path
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -214,7 +215,7 @@ class _Query:
         items: dict[str, object] = {f"{self.noun}s": list(raw)}
         if self.typed is not None:
             found = self.typed.decode(raw)
-            items["values"] = [jsonable(each) for each in found]
+            items["values"] = [_json_value(each, self.typed.element) for each in found]
             wrong = {
                 str(index): {"reason": "undecodable", "detail": str(each)}
                 for index, each in enumerate(found)
@@ -365,6 +366,13 @@ class _Lines:
 
 def _is_absent(error: ModbusError) -> bool:
     return isinstance(error, ModbusException) and error.code == ILLEGAL_ADDRESS
+
+
+def _json_value(value: Any, kind: str) -> Any:
+    """A value for JSON: a float has the digits of its type, as in a table."""
+    if isinstance(value, float) and math.isfinite(value):
+        return float(terminal_text.shown(value, kind))
+    return jsonable(value)
 
 
 def _value_text(value: Any, kind: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -33,6 +33,14 @@ class TaggedDevice:
     unit: int
     timeout: float
     tags: TagList
+
+
+class _ItemTag(Tag):
+    """An item. Its bytes are in hex, as with `--type` and as `write` takes them."""
+
+    def value(self, raw: Any) -> Any:
+        """What the registers hold."""
+        return raw.hex() if isinstance(raw, bytes) else super().value(raw)
 
 
 def chosen(tags: TagList, only: Sequence[str]) -> TagList:
@@ -86,7 +94,7 @@ def _item(each: Item, encoding: str | None) -> Iterable[tuple[Tag, str]]:
 
 def _tag(area: Area, address: int, kind: str, order: str, encoding: str | None) -> Tag:
     text = encoding if kind.startswith("string") else None
-    return Tag(f"{SHORT_OF[area]}:{address}", area, address, kind, order, text)
+    return _ItemTag(f"{SHORT_OF[area]}:{address}", area, address, kind, order, text)
 
 
 def _named(tag: Tag) -> tuple[Tag, str]:
@@ -95,4 +103,4 @@ def _named(tag: Tag) -> tuple[Tag, str]:
 
 
 def _renamed(tag: Tag, name: str) -> Tag:
-    return Tag(name, tag.area, tag.address, tag.type, tag.order, tag.encoding)
+    return _ItemTag(name, tag.area, tag.address, tag.type, tag.order, tag.encoding)
