@@ -6,18 +6,26 @@ import base64
 import binascii
 import math
 import re
-from decimal import Decimal
+from decimal import Decimal, InvalidOperation
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.runtime.text import quote
+from holdfast.values import DoesNotFit
 
 if TYPE_CHECKING:
     from holdfast.values.types import Type
 
 BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
+
+_MAX_DIGITS = 40
+"""Of an integer with a point or an exponent. No register type has as many."""
+
+_LONG = ("int64", "uint64")
+"""Types with integers that a float does not have."""
 
 _NUMBER = re.compile(r"[+-]?([0-9]{1,400}(\.[0-9]{0,400})?|\.[0-9]{1,400})([eE][+-]?[0-9]{1,3})?")
 
@@ -60,6 +68,24 @@ def _number(text: str, named: str, is_float: bool) -> int | float:
     return int(exact)
 
 
+def decimal_from(text: str, type: Type) -> int | float:
+    """Parses a number with a point or an exponent: for integers to one, if it is whole.
+
+    Raises `DoesNotFit`, also for more digits than a float has where a 64-bit integer needs them.
+    """
+    number = float(text)
+    if math.isinf(number):
+        raise DoesNotFit(f"{quote(text)} is not a finite number")
+    if type.is_float:
+        return number
+    exact = Decimal(text)
+    if exact.adjusted() < _MAX_DIGITS and exact == exact.to_integral_value():
+        return int(exact)
+    if type.base in _LONG and Decimal(repr(number)) != exact:
+        raise DoesNotFit(f"{quote(text)} has too many digits, allowed with a point: 15")
+    return number
+
+
 def _bytes(text: str, named: str) -> bytes:
     try:
         return base64.b64decode(text.strip(), validate=True)
@@ -68,9 +94,12 @@ def _bytes(text: str, named: str) -> bytes:
 
 
 def _array(text: str, type: Type, named: str) -> list[Any]:
+    hook = partial(decimal_from, type=type) if type.is_number else None
     try:
-        items = msgspec.json.decode(text)
-    except MALFORMED_JSON:
+        items = msgspec.json.Decoder(float_hook=hook).decode(text)
+    except msgspec.ValidationError as error:  # Of a number.
+        raise ValueError(str(error)) from None
+    except (*MALFORMED_JSON, InvalidOperation):
         items = None
     if not isinstance(items, list):
         raise ValueError(f"{quote(text)} is not a valid {named}, allowed: a JSON array")

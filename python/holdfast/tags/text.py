@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import math
 import re
-from decimal import Decimal
 from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,7 @@ import msgspec
 
 from holdfast.runtime.text import either, quote
 from holdfast.tags.scale import RegisterScale, linear_of
-from holdfast.tags.strict_text import BOOLEANS, from_text
+from holdfast.tags.strict_text import BOOLEANS, decimal_from, from_text
 from holdfast.values import DoesNotFit
 from holdfast.values.digits import shortest
 
@@ -30,12 +29,6 @@ if TYPE_CHECKING:
 SWITCHED = {"on": True, "off": False}
 MAX_PLACES = 6
 """The most decimal places of scaled integers; with more, only those that are needed."""
-
-_MAX_DIGITS = 40
-"""Of an integer with a point or an exponent. No register type has as many."""
-
-_LONG = ("int64", "uint64")
-"""Types with integers that a float does not have."""
 
 _INTEGER = re.compile(r"[+-]?[0-9]{1,40}")
 _HEX = re.compile(r"0[xX][0-9a-fA-F]{1,16}")
@@ -102,15 +95,7 @@ def value_from(tag: Tag, text: str, *, states: bool = True) -> Any:
     if _HEX.fullmatch(word) and not tag.is_float and (tag.scale, tag.offset) == (1, 0):
         return int(word, 16)
     if _DECIMAL.fullmatch(word):
-        exact, number = Decimal(word), float(word)
-        if math.isinf(number):
-            raise DoesNotFit(f"{quote(text)} is not a finite number")
-        is_whole = exact.adjusted() < _MAX_DIGITS and exact == exact.to_integral_value()
-        if is_whole and not tag.is_float:
-            return int(exact)
-        if tag.of_type.base in _LONG and Decimal(repr(number)) != exact:
-            raise DoesNotFit(f"{quote(text)} has too many digits, allowed with a point: 15")
-        return number
+        return decimal_from(word, tag.of_type)
     if flaw := decimal_comma(word):
         raise DoesNotFit(f"{text!r} {flaw}")
     if names:
