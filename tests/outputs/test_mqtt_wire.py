@@ -38,7 +38,9 @@ def plant(tmp_path: Path) -> Iterator[Plant]:
 
 
 @pytest.fixture(params=["5", "3.1.1"])
-def fake(request: pytest.FixtureRequest) -> Iterator[FakeBroker]:
+def fake(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeBroker]:
+    # It answers pings only while a test looks at its packets.
+    monkeypatch.setattr(connection, "MAX_COMMAND_AGE_S", 60)
     with FakeBroker(request.param) as broker:
         yield broker
 
