@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import socket
+import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
@@ -34,6 +35,13 @@ SIXTH = bytes.fromhex("0300060001")
 SIX = bytes.fromhex("03020006")
 WRITE = bytes.fromhex("0600051234")
 VENDOR = bytes.fromhex("4101020304")
+
+ends_are_found = pytest.mark.skipif(
+    sys.platform == "win32", reason="an end behind bytes that are not read is not found"
+)
+
+BESIDE_MEMORY: dict[int | str, Any] = {1: {"route": "bus"}, 2: "plant"}
+MEMORY = {"plant": {"holding_registers": 9}}
 
 EXCHANGES = {
     "1": ("0100000009", "0102ff01"),
@@ -308,13 +316,7 @@ def test_a_device_that_is_polled_has_routes_over_the_same_connection(
 def test_replies_have_the_order_of_their_requests(device: Stream, run: Run) -> None:
     held = Held()
     device.script = [held]
-    appliance = run(
-        configuration(
-            device.url,
-            units={1: {"route": "bus"}, 2: "plant"},
-            memories={"plant": {"holding_registers": 9}},
-        )
-    )
+    appliance = run(configuration(device.url, units=BESIDE_MEMORY, memories=MEMORY))
     units = [1, 2, 1, 1, 2, 2, 1]
     requests = b"".join(wire.frame(READ, unit, number) for number, unit in enumerate(units))
     with wire.Connection(scada(appliance)) as front:
@@ -354,6 +356,43 @@ def test_a_write_that_is_sent_again_before_its_reply_reaches_the_device_once(
     assert [line["outcome"] for line in await_writes(tmp_path / "audit.log", 2)] == ["done"] * 2
 
 
+def test_a_write_that_is_sent_again_behind_a_request_that_waits_reaches_the_device_once(
+    device: Stream, run: Run
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, units=BESIDE_MEMORY, memories=MEMORY))
+    other = wire.frame(bytes.fromhex("0600064321"), transaction=9)
+    write, of_memory = wire.frame(WRITE, transaction=7), wire.frame(READ, 2, 8)
+    with wire.Connection(scada(appliance)) as front:
+        front.send(write + of_memory + other)
+        device.await_requests(1)
+        for sent in (write, other):
+            front.send(sent)
+            wire.until_taken(front.socket)
+        held.release()
+        replies = front.receive_many(5)
+
+    assert [reply.transaction for reply in replies] == [7, 7, 8, 9, 9]
+    assert [asked.pdu for asked in device.requests] == [WRITE, other[7:]]
+
+
+def test_a_repetition_behind_sixteen_requests_that_wait_is_not_sent(
+    device: Stream, run: Run
+) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url))
+    writes = [bytes.fromhex("060005") + bytes([0, number]) for number in range(16)]
+    with wire.Connection(scada(appliance)) as front:
+        front.send(wire.frames(writes) + wire.frames(writes[:8]) + wire.frame(READ, 1, 16))
+        await_count(appliance, "waiting", 16)
+        held.release()
+        assert [reply.transaction for reply in front.receive_many(17)] == [*range(17)]
+
+    assert [asked.pdu for asked in device.requests] == [*writes, READ]
+
+
 @pytest.mark.parametrize("kind", ["tcp", "udp"])
 def test_a_client_with_one_transaction_id_for_all_may_return_to_an_earlier_value(
     device: Stream, run: Run, kind: str
@@ -375,24 +414,22 @@ def test_a_client_with_one_transaction_id_for_all_may_return_to_an_earlier_value
     assert [asked.pdu for asked in device.requests] == requests
 
 
-@pytest.mark.parametrize("kind", ["rtu", "ascii", "rtu-udp"])
+@pytest.mark.parametrize(
+    ("kind", "units"),
+    [("rtu", [1]), ("rtu", [1, 2]), ("ascii", [1]), ("ascii", [1, 2, 1]), ("rtu-udp", [1])],
+    ids=str,
+)
 def test_a_client_without_transaction_ids_that_asks_again_gets_no_earlier_reply(
-    device: Stream, run: Run, kind: str
+    device: Stream, run: Run, kind: str, units: list[int]
 ) -> None:
+    """Also of a request to a memory that waits for others."""
     held = Held()
     device.script = [held]
-    appliance = run(
-        configuration(
-            device.url,
-            kind=kind,
-            units={1: {"route": "bus"}, 2: "plant"},
-            memories={"plant": {"holding_registers": 9}},
-        )
-    )
+    appliance = run(configuration(device.url, kind=kind, units=BESIDE_MEMORY, memories=MEMORY))
     frame = TRANSPORTS[kind].frame
     with client(kind, scada(appliance)) as front:
         assert isinstance(front, FramedConnection | Datagrams)
-        front.send(frame(READ))
+        front.send(b"".join(frame(READ, unit) for unit in units))
         device.await_requests(1)
         assert pauses(front)
         assert front.ask(READ, unit=2) == bytes.fromhex("03020000")
@@ -436,13 +473,7 @@ def test_a_request_to_memory_waits_for_the_write_before_it(
 ) -> None:
     held = Held()
     device.script = [held]
-    appliance = run(
-        configuration(
-            device.url,
-            units={1: {"route": "bus"}, 2: "plant"},
-            memories={"plant": {"holding_registers": 9}},
-        )
-    )
+    appliance = run(configuration(device.url, units=BESIDE_MEMORY, memories=MEMORY))
     connect(scada(appliance)).send(wire.frame(WRITE, 1) + wire.frame(WRITE, 2))
     device.await_requests(1)
     assert appliance.memories["plant"].read("holding_registers", 5, 1) == [0]
@@ -846,24 +877,49 @@ def test_a_client_that_has_gone_keeps_no_place_in_the_queue(
     assert [asked.pdu for asked in device.requests][1:] == [READ]
 
 
+@pytest.mark.parametrize("end", ["reset", "half-closed"])
+@pytest.mark.parametrize(
+    ("unit", "behind"),
+    [
+        pytest.param(1, 0, id="alone"),
+        pytest.param(2, 1, id="before one of memory"),
+        pytest.param(1, 16, id="before 16"),
+        pytest.param(2, 1000, id="before more than is read", marks=ends_are_found),
+    ],
+)
 def test_the_write_of_a_client_that_has_gone_is_not_sent(
-    device: Stream, run: Run, connect: Connect
+    device: Stream, run: Run, connect: Connect, unit: int, behind: int, end: str
 ) -> None:
     held = Held()
     device.script = [held]
-    appliance = run(configuration(device.url))
+    appliance = run(configuration(device.url, units=BESIDE_MEMORY, memories=MEMORY))
     first, gone = connect(scada(appliance)), connect(scada(appliance))
     first.send(wire.frame(READ))
     device.await_requests(1)
-    gone.send(wire.frame(WRITE))
-    await_count(appliance, "waiting", 2)
-    gone.reset()
+    gone.send(wire.frame(WRITE, transaction=behind) + wire.frames([WRITE] * behind, unit))
+    waiting = min(16, 1 + (behind if unit == 1 else 0))
+    await_count(appliance, "waiting", 1 + waiting)
+    gone.reset() if end == "reset" else gone.socket.shutdown(socket.SHUT_WR)
     await_nobody(appliance, others=1)
     held.release()
 
     assert first.receive().pdu == FIVE
-    await_count(appliance, "withdrawn", 1)
+    await_count(appliance, "withdrawn", waiting)
     assert [asked.pdu for asked in device.requests] == [READ]
+    assert appliance.memories["plant"].read("holding_registers", 5, 1) == [0]
+
+
+def test_a_client_that_sends_more_than_is_read_gets_all_replies(device: Stream, run: Run) -> None:
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, units=BESIDE_MEMORY, memories=MEMORY))
+    with wire.Connection(scada(appliance)) as front:
+        front.send(wire.frame(WRITE, transaction=3000) + wire.frames([READ] * 3000, unit=2))
+        device.await_requests(1)
+        held.release()
+        replies = [reply.transaction for reply in front.receive_many(3001)]
+
+    assert replies == [3000, *range(3000)]
 
 
 def test_the_write_of_a_client_that_has_gone_does_not_wait_for_late_replies(

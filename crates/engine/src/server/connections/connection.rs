@@ -3,7 +3,7 @@
 //!
 //! All connections of a worker thread share one pair of buffers ([`Scratch`]): nothing is awaited
 //! between a read and the write that answers it. A connection keeps only what is left over: the
-//! beginning of a request, or replies that a slow peer has not read. While replies wait, no more
+//! beginning of a request, or replies that a slow peer has not read. While such replies wait, no more
 //! requests are read. Requests to devices are answered later ([`super::reply_order`]).
 
 use std::cell::RefCell;
@@ -13,6 +13,7 @@ use std::pin::{Pin, pin};
 use std::sync::Arc;
 use std::task::{Context, Poll};
 
+use holdfast_protocol::frame::mbap;
 use holdfast_protocol::pdu;
 use tokio::runtime::Handle;
 use tokio::sync::watch;
@@ -32,10 +33,10 @@ use crate::server::rights::peer_rights::PeerRights;
 use crate::server::transports::framing::{Ascii, Framing, Mbap, Next, Rtu};
 use crate::server::transports::stream::{self, Stream};
 
-/// Bytes per read of a socket.
+/// Bytes per read of a socket, together with those of a connection that wait.
 const INPUT_BYTES: usize = 4096;
 
-/// Room for the replies to all requests of one read, and for those that come later.
+/// Room for the replies to all requests of one read, or to those that waited, and for those that come later.
 const OUTPUT_BYTES: usize =
     output::<Mbap>(output::<Rtu>(output::<Ascii>(0))) + MAX_WAITING * Ascii::MAX_LEN;
 
@@ -43,7 +44,9 @@ const fn output<F: Framing>(least: usize) -> usize {
     // A read has room for at least one byte.
     assert!(F::MAX_LEN < INPUT_BYTES);
     assert!(F::HEADER_LEN + pdu::MAX_LEN <= F::MAX_LEN);
-    let len = (INPUT_BYTES / F::SHORTEST + 1) * F::MAX_LEN;
+    // Those that waited have an MBAP header: in ASCII, as many would be longer.
+    let shortest = if F::SHORTEST < Mbap::SHORTEST { F::SHORTEST } else { Mbap::SHORTEST };
+    let len = (INPUT_BYTES / shortest + 1) * F::MAX_LEN;
     if len > least { len } else { least }
 }
 
@@ -88,6 +91,8 @@ pub(crate) struct Connection<F: Framing, S> {
     unsent: Vec<u8>,
     /// Reads since other tasks last ran.
     reads_in_turn: u32,
+    /// Whether the runtime may not know that there are bytes to read.
+    is_unaware: bool,
     share: Share,
 }
 
@@ -144,6 +149,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             ticket,
             unsent: Vec::new(),
             reads_in_turn: 0,
+            is_unaware: false,
             share,
         }
     }
@@ -229,8 +235,10 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             if let Poll::Ready(step) = self.poll_deferred(context) {
                 return Poll::Ready(step);
             }
-            if self.answering.is_full() {
-                return Poll::Pending;
+            if self.answering.room() == 0 {
+                self.reads_in_turn = 0;
+                self.is_unaware = true;
+                return stream::poll_end(self.stream.socket(), context).map(Err);
             }
         }
         if self.share.poll(context).is_pending() {
@@ -246,7 +254,14 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
     fn poll_read(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             let partial = self.answering.restore(input);
-            let read = self.stream.poll_read(context, &mut input[partial..], &mut self.unsent);
+            let free = &mut input[partial..][..self.answering.room()];
+            let unsent = &mut self.unsent;
+            let known = if self.is_unaware { self.stream.read_now(free, unsent) } else { None };
+            self.is_unaware = known.is_some();
+            let read = match known {
+                Some(len) => Poll::Ready(Ok(len)),
+                None => self.stream.poll_read(context, free, unsent),
+            };
             let Poll::Ready(read) = read else {
                 self.reads_in_turn = 0;
                 return Poll::Pending;
@@ -268,28 +283,21 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
 
     /// Writes replies that have come, and answers what waited for them.
     fn poll_deferred(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
-        SCRATCH.with_borrow_mut(|Scratch { input, output }| {
+        SCRATCH.with_borrow_mut(|Scratch { output, .. }| {
             let Some(mut len) = self.answering.collect(context, output) else {
                 self.reads_in_turn = 0;
                 return Poll::Pending;
             };
             self.reads_in_turn += 1;
-            let mut broken = false;
-            // Requests that waited for the replies go on at once: no byte need arrive for them.
-            let behind = self.answering.resume(input);
-            if behind > 0 {
+            if self.answering.behind() > 0 {
                 self.renew()?;
-                let answered = self.answering.answer(&input[..behind], &mut output[len..]);
-                len += answered.len;
-                broken = answered.broken;
-                self.note_answered(&answered, 0);
-            } else {
-                self.deadlines.note_request(Instant::now());
+                len += self.answering.resume(&mut output[len..]);
             }
+            self.deadlines.note_request(Instant::now());
             if len > 0 {
                 self.stream.send(&output[..len], &mut self.unsent)?;
             }
-            Poll::Ready(if broken { Err(Kind::BrokenFrame) } else { Ok(()) })
+            Poll::Ready(Ok(()))
         })
     }
 
@@ -361,7 +369,9 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
         let now = Instant::now();
         match self.deadlines.expired(now, self.exchange()) {
             Expired::Nothing => {}
-            Expired::Frame | Expired::Connection(_) if self.share.is_waiting() => {
+            Expired::Frame | Expired::Connection(_)
+                if self.share.is_waiting() || self.answering.room() == 0 =>
+            {
                 self.deadlines.restart(now);
             }
             Expired::Frame => {
@@ -437,46 +447,15 @@ impl<F: Framing> Answering<F> {
         let mut rest = input;
         let mut decoded = F::NOT_DECODED;
         loop {
-            let before = self.before.clone();
             match F::next(&mut self.before, rest, || self.delimiter, &mut decoded) {
                 Next::Request { tag, unit_id, pdu, len } => {
                     if std::mem::take(&mut self.gives_up) {
                         self.give_up();
                     }
-                    let place = self.unit_server.elsewhere(&self.rights, unit_id, pdu);
-                    if place.is_some() || self.deferred.is_some() {
-                        let deferred = self.deferred.get_or_insert_default();
-                        let ours = (&*self.unit_server, &*self.rights, &*self.context);
-                        let request = (tag, unit_id, pdu);
-                        let deferral = if F::HAS_IDS && deferred.repeats(request) {
-                            Deferral::Later(None)
-                        } else {
-                            deferred.defer(ours, place, self.peer.ip(), request)
-                        };
-                        match deferral {
-                            Deferral::Later(refused) => {
-                                self.context.note_refused(
-                                    refused,
-                                    &self.reported,
-                                    Some(&self.peer),
-                                );
-                                rest = &rest[len..];
-                                answered.requests += 1;
-                                continue;
-                            }
-                            Deferral::Wait => {
-                                // It is framed again later, with what was known before it.
-                                deferred.leave(rest);
-                                self.before = before;
-                                rest = &[];
-                                break;
-                            }
-                            Deferral::Now => {}
-                        }
-                    }
                     rest = &rest[len..];
                     answered.requests += 1;
-                    answered.len += self.reply(tag, unit_id, pdu, &mut output[answered.len..]);
+                    let room = &mut output[answered.len..];
+                    answered.len += self.take((tag, unit_id, pdu), room);
                 }
                 Next::Foreign { len } => {
                     rest = &rest[len..];
@@ -502,6 +481,37 @@ impl<F: Framing> Answering<F> {
         answered
     }
 
+    /// Answers a request now, or sends it on its way, or keeps it until others are answered. Returns the length
+    /// of the framed reply, 0 when there is none, or none yet.
+    #[inline]
+    fn take(&mut self, (tag, unit_id, pdu): (u16, u8, &[u8]), output: &mut [u8]) -> usize {
+        let place = self.unit_server.elsewhere(&self.rights, unit_id, pdu);
+        if place.is_some() || self.deferred.is_some() {
+            let deferred = self.deferred.get_or_insert_default();
+            let ours = (&*self.unit_server, &*self.rights, &*self.context);
+            let request = (tag, unit_id, pdu);
+            let peer = self.peer.ip();
+            if let Deferral::Later(refused) = deferred.defer(ours, place, peer, F::HAS_IDS, request)
+            {
+                self.context.note_refused(refused, &self.reported, Some(&self.peer));
+                return 0;
+            }
+        }
+        self.reply(tag, unit_id, pdu, output)
+    }
+
+    /// Answers the requests that waited for others, as far as they need not wait any more. Returns the length of
+    /// the output.
+    fn resume(&mut self, output: &mut [u8]) -> usize {
+        let behind = self.deferred.as_mut().map(|deferred| deferred.resume()).unwrap_or_default();
+        let (mut rest, mut written) = (&behind[..], 0);
+        while let mbap::Next::Frame { transaction_id, unit_id, pdu, len } = mbap::next(rest) {
+            written += self.take((transaction_id, unit_id, pdu), &mut output[written..]);
+            rest = &rest[len..];
+        }
+        written
+    }
+
     /// Keeps an incomplete frame, which is shorter than the longest one.
     fn keep(&mut self, rest: &[u8]) {
         self.partial.clear();
@@ -523,9 +533,16 @@ impl<F: Framing> Answering<F> {
         self.deferred.as_ref().is_some_and(|deferred| !deferred.is_empty())
     }
 
-    /// Whether nothing more may be read before a reply has come.
-    fn is_full(&self) -> bool {
-        self.deferred.as_ref().is_some_and(|deferred| deferred.is_full())
+    /// The bytes of requests that wait until others are answered.
+    #[inline]
+    fn behind(&self) -> usize {
+        self.deferred.as_ref().map_or(0, |deferred| deferred.behind())
+    }
+
+    /// How many bytes may be read: a peer that sends requests faster than they are answered is held back.
+    #[inline]
+    fn room(&self) -> usize {
+        INPUT_BYTES.saturating_sub(self.partial.len() + self.behind())
     }
 
     /// Writes the replies that have come at the start of `output`, framed. Returns their length; `None`
@@ -571,11 +588,6 @@ impl<F: Framing> Answering<F> {
             }
             drop(running);
         });
-    }
-
-    /// Copies what waited for replies to the start of `input`. Returns its length.
-    fn resume(&mut self, input: &mut [u8]) -> usize {
-        self.deferred.as_mut().map_or(0, |deferred| deferred.resume(input))
     }
 
     /// Writes one framed reply at the start of `output`. Returns its length, 0 when there is none.

@@ -2,7 +2,8 @@
 //! only requests that are answered elsewhere overtake each other on their way.
 //!
 //! A request that can be answered here waits until all before it are answered: its client expects the
-//! effects of those. A connection with too many such requests is not read for a while.
+//! effects of those. All behind it wait too. The connection is read meanwhile: its end, a repetition or a newer
+//! request decides what becomes of those that wait.
 //!
 //! Without transaction ids, a client that sends another request after a pause has given up: no reply to an
 //! earlier one may come then.
@@ -14,6 +15,7 @@ use std::sync::Arc;
 use std::task::{Context, Poll};
 
 use holdfast_memory::Memory;
+use holdfast_protocol::frame::mbap;
 use holdfast_protocol::pdu::ExceptionCode;
 use tokio::sync::watch;
 
@@ -33,8 +35,8 @@ pub(in crate::server) const MAX_WAITING: usize = 16;
 pub(in crate::server) struct Deferred {
     source: u64,
     waiting: VecDeque<Waiting>,
-    /// Received bytes that are read as requests when there is room again.
-    unread: Vec<u8>,
+    /// Requests that are not on their way yet, in whatever framing they came: as frames with an MBAP header.
+    behind: Vec<u8>,
 }
 
 /// A request without its reply.
@@ -43,6 +45,8 @@ pub(in crate::server) struct Waiting {
     reply: Expected,
     /// How often it was sent. Each time is answered, as by a device.
     times: usize,
+    /// Whether no other request with its transaction id has come after it.
+    is_newest: bool,
     /// Whether a journal carries it out. Those of a connection are carried out in their order.
     is_step: bool,
 }
@@ -70,15 +74,13 @@ pub(in crate::server) enum Expected {
 pub(in crate::server) enum Deferral {
     /// Its reply comes later. It may already be refused.
     Later(Option<RefusedRequest>),
-    /// It must wait until others are answered.
-    Wait,
     /// It can be answered now.
     Now,
 }
 
 impl Default for Deferred {
     fn default() -> Deferred {
-        Deferred { source: source(), waiting: VecDeque::new(), unread: Vec::new() }
+        Deferred { source: source(), waiting: VecDeque::new(), behind: Vec::new() }
     }
 }
 
@@ -87,39 +89,43 @@ impl Deferred {
         self.waiting.is_empty()
     }
 
-    /// Whether received bytes wait until there is room.
-    pub(in crate::server) fn is_full(&self) -> bool {
-        !self.unread.is_empty()
+    /// The bytes of requests that are not on their way yet. While there are any, others are.
+    pub(in crate::server) fn behind(&self) -> usize {
+        self.behind.len()
     }
 
     /// Whether a request is the newest one of its transaction id, sent again before its reply: then it gets
     /// the same reply. Passed on, it could undo a later write of another client. Reads are harmless. An older
     /// one does not count: a client may use one id for all requests, and return to an earlier value.
-    pub(in crate::server) fn repeats(&mut self, (tag, unit_id, request): (u16, u8, &[u8])) -> bool {
+    fn repeats(&mut self, (tag, unit_id, request): (u16, u8, &[u8])) -> bool {
         let has_room = self.has_room();
         let newest = self.waiting.iter_mut().rev().find(|waiting| waiting.asked.tag == tag);
-        let Some(waiting) = newest.filter(|Waiting { asked, .. }| {
-            has_room && asked.unit_id == unit_id && asked.request == request && !only_reads(request)
-        }) else {
-            return false;
-        };
-        waiting.times += 1;
-        true
+        let Some(Waiting { asked, times, is_newest, .. }) = newest else { return false };
+        *is_newest &= asked.unit_id == unit_id && asked.request == request && !only_reads(request);
+        if *is_newest && has_room {
+            *times += 1;
+        }
+        *is_newest
     }
 
     fn has_room(&self) -> bool {
         self.waiting.iter().map(|waiting| waiting.times).sum::<usize>() < MAX_WAITING
     }
 
-    /// Sends a request on its way, if its unit is elsewhere and there is room.
+    /// Sends a request on its way, if its unit is elsewhere and there is room. Keeps it if it must wait until
+    /// others are answered.
     pub(in crate::server) fn defer(
         &mut self,
         (unit_server, rights, context): (&UnitServer, &PeerRights, &ListenerContext),
         place: Option<&Elsewhere>,
         peer: IpAddr,
+        has_ids: bool,
         (tag, unit_id, request): (u16, u8, &[u8]),
     ) -> Deferral {
-        let place = match place {
+        if has_ids && self.repeats((tag, unit_id, request)) {
+            return Deferral::Later(None);
+        }
+        let place = match place.filter(|_| self.behind.is_empty()) {
             // Without a request before it, nothing can reorder its effects.
             None if self.is_empty() => return Deferral::Now,
             Some(place @ Elsewhere::Device(_)) if self.has_room() => place,
@@ -130,7 +136,11 @@ impl Deferred {
             {
                 place
             }
-            _ => return Deferral::Wait,
+            _ => {
+                self.behind.extend_from_slice(&mbap::header(tag, unit_id, request.len()));
+                self.behind.extend_from_slice(request);
+                return Deferral::Later(None);
+            }
         };
         let asker = Asker { source: self.source, peer: Some(peer) };
         let (asked, reply, refused) =
@@ -138,7 +148,7 @@ impl Deferred {
                 unit_server.forward(rights, place, &asker, unit_id, request, permit)
             });
         let is_step = matches!(place, Elsewhere::Journal(_));
-        self.waiting.push_back(Waiting { asked, reply, times: 1, is_step });
+        self.waiting.push_back(Waiting { asked, reply, times: 1, is_newest: true, is_step });
         Deferral::Later(refused)
     }
 
@@ -153,20 +163,13 @@ impl Deferred {
                 pending.give_up();
             }
         }
+        self.behind = Vec::new();
         std::mem::take(&mut self.waiting)
     }
 
-    /// Keeps received bytes until there is room.
-    pub(in crate::server) fn leave(&mut self, bytes: &[u8]) {
-        debug_assert!(self.unread.is_empty() && !bytes.is_empty());
-        self.unread.extend_from_slice(bytes);
-    }
-
-    /// Moves those bytes to the start of `input`, and returns their length.
-    pub(in crate::server) fn resume(&mut self, input: &mut [u8]) -> usize {
-        let unread = std::mem::take(&mut self.unread);
-        input[..unread.len()].copy_from_slice(&unread);
-        unread.len()
+    /// Takes the requests that are not on their way yet, as frames with an MBAP header.
+    pub(in crate::server) fn resume(&mut self) -> Vec<u8> {
+        std::mem::take(&mut self.behind)
     }
 
     /// The next reply, once it is there, and how often it is sent.

@@ -42,7 +42,7 @@ pub(crate) trait Framing: Send + Sync + 'static {
     const HAS_IDS: bool;
 
     /// What is known of the bytes before those that are looked at.
-    type Before: Default + Clone + Send;
+    type Before: Default + Send;
 
     /// Room for a decoded frame, where the PDU is not in the frame as it is.
     type Decoded;

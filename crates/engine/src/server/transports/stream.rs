@@ -1,10 +1,12 @@
 //! The stream of a connection: a socket, or TLS over a socket.
 
 use std::io::{self, ErrorKind, Read, Write};
-use std::task::{Context, Poll};
+use std::pin::pin;
+use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use socket2::SockRef;
+use tokio::io::Interest;
 use tokio::net::TcpStream;
 use tokio::time::timeout;
 
@@ -125,6 +127,24 @@ pub(crate) async fn send_all(
     Ok(())
 }
 
+/// Waits until the peer ends its side of the connection, also behind bytes that are not read. Afterwards the
+/// runtime may not know of these bytes: [`Stream::read_now`] finds them.
+pub(crate) fn poll_end(socket: &TcpStream, context: &mut Context<'_>) -> Poll<Kind> {
+    loop {
+        let reported = ready!(socket.poll_read_ready(context));
+        let ready = ready!(pin!(socket.ready(Interest::READABLE)).poll(context));
+        if reported.is_err() || ready.is_ok_and(|ready| ready.is_read_closed()) {
+            return Poll::Ready(Kind::Closed);
+        }
+        // Windows reports bytes that are not read again at once: there, the end is found when they are read.
+        if cfg!(windows) {
+            return Poll::Pending;
+        }
+        // The next report is that of more bytes, or of the end.
+        let _ = socket.try_io(Interest::READABLE, || Err::<(), _>(ErrorKind::WouldBlock.into()));
+    }
+}
+
 /// Reads directly from the system, even if the runtime does not report the socket as readable.
 pub(crate) fn read(socket: &TcpStream, input: &mut [u8]) -> Option<usize> {
     (&*SockRef::from(socket)).read(input).ok().filter(|len| *len > 0)
@@ -135,4 +155,36 @@ pub(crate) fn flush_now(socket: &TcpStream, unsent: &mut Vec<u8>) -> io::Result<
     let written = (&*SockRef::from(socket)).write_all(unsent);
     unsent.clear();
     written
+}
+
+#[cfg(test)]
+mod tests {
+    use std::future::poll_fn;
+    use std::task::Waker;
+
+    use super::*;
+
+    #[cfg(not(windows))]
+    #[test]
+    fn the_end_is_found_behind_bytes_that_are_not_read() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(async {
+            let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let mut peer = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+            let (mut socket, _) = listener.accept().await.unwrap();
+            peer.write_all(&[1; 100]).unwrap();
+            socket.readable().await.unwrap();
+            let mut context = Context::from_waker(Waker::noop());
+            assert!(poll_end(&socket, &mut context).is_pending());
+            let mut input = [0; 60];
+            assert_eq!(socket.read_now(&mut input, &mut Vec::new()), Some(60));
+            assert!(poll_end(&socket, &mut context).is_pending());
+
+            peer.shutdown(std::net::Shutdown::Write).unwrap();
+            assert_eq!(poll_fn(|context| poll_end(&socket, context)).await, Kind::Closed);
+            assert_eq!(socket.read_now(&mut input, &mut Vec::new()), Some(40));
+            let end = poll_fn(|context| socket.poll_read(context, &mut input, &mut Vec::new()));
+            assert_eq!(end.await, Err(End::ByPeer));
+        });
+    }
 }
