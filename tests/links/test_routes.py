@@ -161,6 +161,24 @@ def test_a_function_of_a_vendor_that_is_not_listed_is_refused(
     assert [asked.pdu for asked in device.requests] == [READ]
 
 
+def test_function_43_passes_with_another_mei_type_only_if_it_is_listed(
+    unmodelled: FakeDevice, run: Run, connect: Connect, caplog: pytest.LogCaptureFixture
+) -> None:
+    """CANopen, as type 13, has no known length: a line could find a write to another unit in it."""
+    canopen = bytes.fromhex("2b0d00 714c 63 0600071234")
+    for rule in ({}, {"deny": [5]}):
+        appliance = run(configuration(unmodelled.url, rule=rule))
+        assert connect(scada(appliance)).ask(canopen) == exception(canopen, 1)
+        log_events(appliance)
+    assert not unmodelled.asked
+    fields = [vars(each)["fields"] for each in caplog.records if each.message == "refused_function"]
+    assert [refused["function"] for refused in fields] == [43, 43]
+
+    listed = run(configuration(unmodelled.url, rule={"functions": [3, 43]}))
+    assert connect(scada(listed)).ask(canopen) == canopen
+    assert unmodelled.asked == [canopen]
+
+
 @pytest.mark.parametrize("code", [1, 2, 4, 6, 10, 11, 0x63, 0xFF])
 def test_the_exceptions_of_the_device_come_through(
     unmodelled: FakeDevice, run: Run, connect: Connect, code: int

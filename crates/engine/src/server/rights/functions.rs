@@ -1,7 +1,7 @@
 //! Which functions a rule allows, and which requests are known to only read.
 
 use holdfast_protocol::frame::rtu_stream::is_one_request;
-use holdfast_protocol::pdu::{Function, Request};
+use holdfast_protocol::pdu::{ExceptionCode, Function, Request};
 
 /// What answers the requests to a unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -95,6 +95,12 @@ fn is_allowed(code: u8, functions: &Functions, access: AccessMode, answerer: Ans
 pub(in crate::server) fn is_write(request: &[u8]) -> bool {
     let code = request.first().copied().unwrap_or_default();
     Function::from_code(code).is_some_and(Function::is_write)
+}
+
+/// Whether a request is function 43 with another MEI type than 14. Its length is unknown.
+pub(in crate::server) fn is_other_interface(request: &[u8]) -> bool {
+    request.first() == Some(&Function::EncapsulatedInterface.code())
+        && Request::parse(request) == Err(ExceptionCode::IllegalFunction)
 }
 
 /// Whether a request is known to change nothing in a device. Behind a line, or behind a gateway to one,

@@ -7,7 +7,9 @@ use holdfast_memory::{Area, Memory};
 use holdfast_protocol::pdu::{ExceptionCode, Function, Request, SubFunction};
 
 use crate::server::requests::exceptions::NOT_ALLOWED;
-use crate::server::rights::functions::{AccessMode, Answerer, Codes, only_reads};
+use crate::server::rights::functions::{
+    AccessMode, Answerer, Codes, Functions, is_other_interface, only_reads,
+};
 use crate::server::rights::ranges::Ranges;
 use crate::server::rights::rule::{Elsewhere, Rule};
 
@@ -27,6 +29,8 @@ struct UnitRights {
     /// everything.
     places: Option<Box<[Elsewhere]>>,
     functions: Codes,
+    /// Whether function 43 was listed: a device gets it with any MEI type then.
+    lists_interface: bool,
     access: AccessMode,
     /// `None` if there is no limit.
     ranges: Option<Box<Ranges>>,
@@ -61,6 +65,9 @@ impl UnitRights {
             },
         };
         let functions = Codes::of(allowed, access, answerer);
+        let interface = Function::EncapsulatedInterface.code();
+        let lists_interface =
+            matches!(allowed, Functions::Only(codes) if codes.contains(&interface));
         let known = match answerer {
             Answerer::Memory { .. } => functions,
             // A peer must not learn which units are of devices.
@@ -70,8 +77,16 @@ impl UnitRights {
         let places: Box<[_]> =
             elsewhere.into_iter().chain(journal.map(Elsewhere::Journal)).collect();
         let places = (!places.is_empty()).then_some(places);
-        let unit =
-            UnitRights { memory, places, functions, access, ranges, exception_status, queues };
+        let unit = UnitRights {
+            memory,
+            places,
+            functions,
+            lists_interface,
+            access,
+            ranges,
+            exception_status,
+            queues,
+        };
         (unit, known)
     }
 }
@@ -169,9 +184,12 @@ impl PeerRights {
     }
 
     /// Whether a request to a device is denied although its function is allowed: a read-only peer may send
-    /// only what is known to change nothing, which a sub-function decides too.
+    /// only what is known to change nothing, which a sub-function decides too. And what has no known length could
+    /// be several requests on a line: it must be listed.
     pub(crate) fn denies(&self, unit_id: u8, request: &[u8]) -> bool {
+        let lists_interface = self.unit(unit_id).is_some_and(|unit| unit.lists_interface);
         self.is_read_only(unit_id) && !only_reads(request)
+            || !lists_interface && is_other_interface(request)
     }
 
     /// One unit id per memory, chosen among the `wanted` unit ids: the first one that may do what is
