@@ -526,6 +526,12 @@ class Batch:
         out. Raises `BatchRefused`; nothing has changed then.
         """
 
+    def submit(self, ended: Callable[[tuple[int, int | None] | BatchRefused], object]) -> None:
+        """As `write`, by the journal of the memories and without waiting for it.
+
+        Calls `ended` in another thread, with the result or the error.
+        """
+
 @final
 class Rule:
     """What the peers of some networks may do.

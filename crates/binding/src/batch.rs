@@ -10,6 +10,7 @@ use pyo3::pybacked::PyBackedBytes;
 use pyo3::types::{PyBytes, PyList, PyString, PyTuple};
 
 use crate::audit_fields;
+use crate::ended_writes::Waiting;
 use crate::memory::{Memory, Unfit, integer, is_text, item, put};
 
 pyo3::create_exception!(
@@ -107,6 +108,14 @@ impl Batch {
     fn write(&self, py: Python<'_>) -> PyResult<(usize, Option<u64>)> {
         self.carry_out(py).map_err(|error| refused(py, error))
     }
+
+    /// As `write`, by the journal of the memories and without waiting for it. `ended` is called in
+    /// another thread, with the result or the `BatchRefused`.
+    fn submit(&self, py: Python<'_>, ended: Py<PyAny>) {
+        let (mut waiting, packed) = (Waiting::new(ended, self.count()), self.packed());
+        let done = Box::new(move |outcome| waiting.end(outcome));
+        py.detach(|| holdfast_memory::submit_across(self.access, &packed, done));
+    }
 }
 
 impl Batch {
@@ -121,7 +130,12 @@ impl Batch {
     pub fn carry_out(&self, py: Python<'_>) -> Result<(usize, Option<u64>), Refused> {
         let packed = self.packed();
         let sequence = py.detach(|| holdfast_memory::write_across(self.access, &packed))?;
-        Ok((self.writes.iter().map(|write| write.count).sum(), sequence))
+        Ok((self.count(), sequence))
+    }
+
+    /// The number of values.
+    fn count(&self) -> usize {
+        self.writes.iter().map(|write| write.count).sum()
     }
 
     /// The lines of the audit log, without time and place in the chain.
@@ -221,7 +235,7 @@ fn listed<'py>(values: &Bound<'py, PyAny>) -> PyResult<Option<Bound<'py, PyList>
     Ok(Some(list))
 }
 
-fn refused(py: Python<'_>, Refused { index, refusal: because }: Refused) -> PyErr {
+pub(crate) fn refused(py: Python<'_>, Refused { index, refusal: because }: Refused) -> PyErr {
     let error = refusal(py, index, None, reason(because));
     let noted = error.value(py).setattr("detail", because.to_string());
     noted.err().unwrap_or(error)

@@ -10,6 +10,7 @@ mod channel;
 mod client;
 mod connection;
 mod constants;
+mod ended_writes;
 mod engine;
 mod exchange;
 mod follower;

@@ -37,7 +37,7 @@ mod write_queue;
 pub use area::{Area, Layout, Span};
 pub use error::{LayoutError, Refusal, Refused};
 pub use follower::{Change, Follower};
-pub use memory::{Contents, Memory, check_across, write_across};
+pub use memory::{Contents, Memory, check_across, submit_across, write_across};
 pub use mirrored::{Freshness, Mirrored};
 pub use operation::{Access, Read, Write};
 pub use seal::{Gate, GateMode};

@@ -765,11 +765,25 @@ pub fn write_across(
     access: Access,
     writes: &[(&Memory, Write<'_>)],
 ) -> Result<Option<u64>, Refused> {
-    check_across(access, writes)?;
     if writes.iter().any(|(memory, _)| memory.has_journal()) {
-        return wait(|done| submit_across(access, writes, done)).map(|done| done.sequence);
+        let submit = |done| {
+            submit_across(access, writes, done);
+            Ok(())
+        };
+        return wait(submit).map(|done| done.sequence);
     }
+    check_across(access, writes)?;
     write_checked(Writer::now(access), writes).map(|()| None)
+}
+
+/// As [`write_across`], by the journal of the memories, without waiting for it. `done` gets all errors. It
+/// is called from any thread, also before this returns.
+#[cold]
+pub fn submit_across(access: Access, writes: &[(&Memory, Write<'_>)], done: Done) {
+    match step_across(access, writes) {
+        Ok((journal, step)) => journal.submit(step, done),
+        Err(refused) => done(Err(refused)),
+    }
 }
 
 /// As [`write_across`], by a journal.
@@ -785,13 +799,12 @@ pub(crate) fn carry_out_across(
     write_checked(writer, writes)
 }
 
-/// Gives writes that were checked to the journal of their memories, as one step.
-#[cold]
-fn submit_across(
+/// The writes as one step, and the journal that carries it out.
+fn step_across<'m>(
     access: Access,
-    writes: &[(&Memory, Write<'_>)],
-    done: Done,
-) -> Result<(), Refused> {
+    writes: &[(&'m Memory, Write<'_>)],
+) -> Result<(&'m dyn Journal, Step), Refused> {
+    check_across(access, writes)?;
     let Some((journal, _)) = writes.first().and_then(|(memory, _)| memory.journal.get()) else {
         return Err(Refused { index: 0, refusal: Refusal::NotOneStep });
     };
@@ -803,8 +816,7 @@ fn submit_across(
         memory.admit(&memory.shared(), access).map_err(refused)?;
         step.push(StepWrite::new(*member, write));
     }
-    journal.submit(Step { access, tenure: None, action: Action::Write(step) }, done);
-    Ok(())
+    Ok((&**journal, Step { access, tenure: None, action: Action::Write(step) }))
 }
 
 fn write_checked(writer: Writer, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {

@@ -7,6 +7,7 @@ Accesses are counted, and writes are audited.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import threading
@@ -50,6 +51,9 @@ _BOOLS_KEYS = {"memory", "area", "address", "bools"}
 
 Write: TypeAlias = "tuple[Memory, str, int, list[Any]] | tuple[Memory, str, int, list[Any], bool]"
 """A write; the last item says that it is granted only while the memory is sealed."""
+
+_Outcome: TypeAlias = "tuple[int, int | None] | _core.BatchRefused"
+"""The result of a write: the number of its values and its sequence in a log; or its refusal."""
 
 
 @dataclass(frozen=True)
@@ -170,6 +174,28 @@ class MemoryAccess:
                 return self._accepted(begun, values)
             code = self._to_device(begun, lambda passage, *write: passage.write(*write))
             return self.answered(begun, code)
+
+    async def keep(self, begun: Begun) -> Written | None:
+        """As `finish`, of memories that are kept, without occupying a thread. Raises `Refused`.
+
+        Writes are carried out in the order in which they came, and also if nobody waits any more.
+        Returns `None` if a device must take the write.
+        """
+        assert begun.writes is not None
+        loop = asyncio.get_running_loop()
+        ended: asyncio.Future[_Outcome] = loop.create_future()
+        begun.writes.submit(partial(_set_outcome, loop, ended))
+        with self.refusing(begun):
+            try:
+                outcome = await ended
+            except asyncio.CancelledError:
+                # The record of the write must say what is known of it.
+                with contextlib.suppress(Refused), self.refusing(begun):
+                    outcome = _not_confirmed() if ended.cancelled() else ended.result()
+                    self._kept(begun, outcome)
+                raise
+            values = self._kept(begun, outcome)
+            return None if begun.device is not None else self._accepted(begun, values)
 
     def waits(self, begun: Begun) -> bool:
         """Whether a write to memory can take as long as a disk or a log needs to answer."""
@@ -386,19 +412,25 @@ class MemoryAccess:
 
     def _stored(self, begun: Begun) -> int:
         """Writes to memory. Returns the number of values: 0 if a device must take them."""
-        recording = begun.recording
         assert begun.writes is not None
         try:
-            if recording is not None:
-                recording.write()
-            values, sequence = begun.writes.write()
-            if recording is not None:
-                recording.done(sequence)
+            if begun.recording is not None:
+                begun.recording.write()
+            outcome: _Outcome = begun.writes.write()
         except Unrecorded:
             raise unrecorded(begun.command) from None
         except _core.BatchRefused as refused:
-            begun.device = self._device(begun, refused)
+            outcome = refused
+        return self._kept(begun, outcome)
+
+    def _kept(self, begun: Begun, outcome: _Outcome) -> int:
+        """Records the outcome of a write. Returns as `_stored`."""
+        if isinstance(outcome, _core.BatchRefused):
+            begun.device = self._device(begun, outcome)
             return 0
+        values, sequence = outcome
+        if begun.recording is not None:
+            begun.recording.done(sequence)
         return values
 
     def _device(self, begun: Begun, refused: _core.BatchRefused) -> str:
@@ -552,6 +584,26 @@ class MemoryAccess:
         found = f"{prefix(index)}{count} from address {shown(address)} of {area}"
         where = place_of(index, memory, area, address)
         return Refused("out_of_range", f"{found}, {allowed}", **where)
+
+
+def _set_outcome(
+    loop: asyncio.AbstractEventLoop, ended: asyncio.Future[_Outcome], outcome: _Outcome
+) -> None:
+    """Ends a write of an event loop, from another thread."""
+
+    def set_outcome() -> None:
+        if not ended.done():
+            ended.set_result(outcome)
+
+    with contextlib.suppress(RuntimeError):  # The loop is already closed.
+        loop.call_soon_threadsafe(set_outcome)
+
+
+def _not_confirmed() -> _core.BatchRefused:
+    """The refusal of a write whose outcome nobody waits for."""
+    refused = _core.BatchRefused()
+    refused.command, refused.index, refused.reason = 0, None, "not_confirmed"
+    return refused
 
 
 _SCALAR: Any = bool | int | float | str | None

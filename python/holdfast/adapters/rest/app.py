@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from holdfast.adapters.diagnostics import DiagnosticsSource
     from holdfast.adapters.sessions import SessionControl
     from holdfast.config.models.services import RestConfig
-    from holdfast.ingest import Grant, MemoryAccess, Written
+    from holdfast.ingest import Begun, Grant, MemoryAccess, Written
     from holdfast.net.http.operations import Later, Operation
 
     Given: TypeAlias = Mapping[str, Any]
@@ -118,10 +118,14 @@ class App(Application):
         begun = access.begin(body, grant, request.peer)
         if begun.device is not None:
             return _written(self._device_writes.carry_out(request, begun))
-        finish = partial(access.finish, begun)
         if access.waits(begun):
-            return _written(asyncio.to_thread(finish))
-        return lambda: response(JSON, _answer(finish()))
+            return _written(self._keep(request, begun))
+        return lambda: response(JSON, _answer(access.finish(begun)))
+
+    async def _keep(self, request: Request, begun: Begun) -> Written:
+        written = await self._memory_access.keep(begun)
+        # Since it began, a reload may have given the range to a device.
+        return written or await self._device_writes.carry_out(request, begun)
 
     def _parser(self, grant: Grant) -> tuple[Commands, Callable[[ParsedWrites], object]]:
         """What parses the commands of a token, and carries them out."""
