@@ -8,6 +8,7 @@ import pytest
 
 import holdfast
 from holdfast._core import MemoryFile
+from holdfast.config.text import yaml_document
 from support.cli import answer, done, invoke, usage_error
 
 if TYPE_CHECKING:
@@ -96,6 +97,31 @@ def test_what_is_exported_can_be_imported(
     [told] = done("memory", "import", other, values)
     assert told == f"other: {30 if zeros else 3} values stored in {other}"
     assert registers(other, "other") == [7, 0, 8, 1]
+
+
+@pytest.mark.parametrize("kind", ["csv", "yaml"])
+@pytest.mark.parametrize("zeros", [[], ["--zeros"]])
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_a_memory_of_any_size_can_be_exported_and_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, zeros: list[str], step: int
+) -> None:
+    """The limits of `initial` follow the memory, however its values are written."""
+    monkeypatch.setattr("holdfast.config.initial_values.MAX_CSV_BYTES", 1)
+    monkeypatch.setattr(yaml_document, "MAX_BYTES", 1)
+    monkeypatch.setattr(yaml_document, "MAX_WRITTEN", 1)
+    monkeypatch.setattr(yaml_document, "MAX_VALUES", 1)
+    memory = holdfast.Memory(discrete_inputs=(65500, 36), files={65535: 40, 1: 1})
+    given = [int(at % step == 0) for at in range(36)]
+    path, values = tmp_path / "plant.redb", str(tmp_path / f"values.{kind}")
+    kept = MemoryFile(path, [("plant", memory)], 0)
+    memory.write("discrete_inputs", 65500, given)
+    memory.write("file:65535", 0, [65535 * bit for bit in given])
+    kept.start()
+    kept.stop()
+    assert done("memory", "export", str(path), "--output", values, *zeros) == []
+    [stored] = done("memory", "import", str(path), values)
+    count = 77 if zeros else 2 * sum(given)
+    assert stored == f"plant: {count} values stored in {path}"
 
 
 def test_values_are_merged_on_request(file: str, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 MAX_BYTES = 8 << 20
-"""The size limit of a file. Everything that is read from one has a lower limit."""
+"""The size limit of a file. Only initial values of a memory with `files` can be larger."""
 
 
 def files_of(file: Path, config: Config) -> list[Path]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 KINDS = (".csv", ".yaml", ".yml")
 MAX_CSV_BYTES = 8 << 20
-"""The size limit of a CSV file. All values of a memory take less."""
+"""The size limit of a CSV file. All values of four areas take less; `files` raise it."""
 
 HEADER = ["area", "address", "value"]
 
@@ -50,10 +50,19 @@ class _Given(NamedTuple):
     value: object
 
 
-def read(path: Path, file: str) -> str:
-    """Reads a file of initial values; messages call it `file`. Raises `ConfigError`."""
-    max_bytes = MAX_CSV_BYTES if path.suffix.lower() == ".csv" else yaml_document.MAX_BYTES
-    return yaml_document.read_text(path, file, "YAML or CSV", max_bytes)
+def read(path: Path, file: str, areas: Mapping[str, range | None]) -> str:
+    """Reads a file of initial values; messages call it `file`. Raises `ConfigError`.
+
+    All values of `areas`, each in a line of its own, are not too large.
+    """
+    if path.suffix.lower() == ".csv":
+        least, lines = MAX_CSV_BYTES, [f"{area},65535,65535\r\n" for area in areas]
+    else:
+        least, lines = yaml_document.MAX_BYTES, ["  65535: [65535]\r\n"] * len(areas)
+    counts = _counts(areas)
+    # One more line of each area, for its name.
+    most = sum(len(line) * (count + 1) for line, count in zip(lines, counts, strict=True))
+    return yaml_document.read_text(path, file, "YAML or CSV", max(least, most))
 
 
 def parse(
@@ -73,6 +82,10 @@ def parse(
     except ConfigError as error:
         judge.problems += error.problems
     return tuple(judge.runs()), judge.problems
+
+
+def _counts(areas: Mapping[str, range | None]) -> list[int]:
+    return [len(addresses or range(ADDRESSES)) for addresses in areas.values()]
 
 
 @dataclass
@@ -159,7 +172,9 @@ def _integer(text: str) -> int | str:
 
 
 def _yaml(text: str, judge: _Judge) -> Iterator[_Given]:
-    document, problems = yaml_document.parse(text, judge.file)
+    # Each value in a list of its own, with its address, and the names of the areas.
+    most = sum(3 * count + 2 for count in _counts(judge.areas))
+    document, problems = yaml_document.parse(text, judge.file, room=most + 1)
     judge.problems += problems
     if document.data is None:
         return

@@ -89,8 +89,8 @@ def import_(file: Path, values: Path, name: str | None, merge: bool) -> None:
     found = _contents(file)
     areas = _chosen(found, name, file)
     try:
-        text = read(values, str(values))
         spans: dict[str, range | None] = {area: kept.addresses for area, kept in areas.items()}
+        text = read(values, str(values), spans)
         runs, problems = parse(text, str(values), spans, None)
     except ConfigError as error:
         runs, problems = (), list(error.problems)

@@ -132,14 +132,14 @@ def _check_initial(scope: Scope, path: KeyPath, memory: MemoryConfig) -> None:
         report.add(path, f"found {show(file)}, allowed: a file with one of {allowed}")
         return
     shown = str(Path(report.document.file).parent / file)
-    try:
-        text = initial_values.read(memory.initial, shown)
-    except ConfigError as error:
-        report.add(path, f"found {show(file)}, which {error.problems[0].message}")
-        return
     places: dict[str, range | None] = {area: areas[area] for area in areas}
     with until_invalid():
         places |= {f"file:{number}": range(records) for number, records in memory.files.items()}
+    try:
+        text = initial_values.read(memory.initial, shown, places)
+    except ConfigError as error:
+        report.add(path, f"found {show(file)}, which {error.problems[0].message}")
+        return
     runs, problems = initial_values.parse(text, shown, places, gate)
     memory.with_initial_values(runs)
     report.elsewhere += problems

@@ -188,22 +188,25 @@ def parse(
     *,
     merges: bool = False,
     max_values: int = MAX_VALUES,
+    room: int = 0,
 ) -> tuple[Document, list[Problem]]:
     """Returns the document and its problems. Raises `ConfigError` if the YAML is not valid.
 
     For files of other programs: `resolve` gives scalars with a tag of their own a value, which must
     be a scalar. With `merges`, the key `<<` adds the keys of other mappings that are not there.
-    `max_values` counts values with aliases expanded.
+    `max_values` counts values with aliases expanded. `room` is a number of keys and values that is
+    allowed in any case.
     """
+    max_written, max_values = max(MAX_WRITTEN, room), max(max_values, room)
     if found := _NOT_ALLOWED.search(text):
         line = text[: found.start()].count("\n") + 1
         raise _error(file, f"the character U+{ord(found[0]):04X} is not allowed in YAML", line)
     try:
         # Text without a value has no events, from either parser.
-        events = yaml_events(text, MAX_WRITTEN) or _slow_events(text, file)
-        reader = _Reader(events, resolve, merges=merges)
+        events = yaml_events(text, max_written) or _slow_events(text, file)
+        reader = _Reader(events, resolve, merges=merges, max_written=max_written)
     except _TooMany:
-        raise _error(file, f"more than {MAX_WRITTEN} keys and values, the limit") from None
+        raise _error(file, f"more than {max_written} keys and values, the limit") from None
     except RecursionError:
         raise _error(file, "not a configuration: nested too deeply") from None
     data, spot = reader.document
@@ -231,7 +234,12 @@ class _Reader:
     """Makes data of the events of one document."""
 
     def __init__(
-        self, events: Iterable[YamlEvent], resolve: Resolve | None, *, merges: bool
+        self,
+        events: Iterable[YamlEvent],
+        resolve: Resolve | None,
+        *,
+        merges: bool,
+        max_written: int,
     ) -> None:
         self._resolve = resolve
         self._merges = merges
@@ -240,7 +248,7 @@ class _Reader:
         of another program may be read."""
         self.mistakes: list[tuple[Place, KeyPath, str]] = []
         self._events = iter(events)
-        self._left = MAX_WRITTEN
+        self._left = max_written
         self._anchors: dict[int | str, tuple[Any, _Spot] | None] = {}
         """What an anchor names, `None` while its value is being read."""
         first = next(self._events, None)
