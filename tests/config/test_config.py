@@ -520,10 +520,22 @@ def test_initial_values_from_yaml_may_be_lists(loaded: Callable[..., Config]) ->
     )
 
 
-def test_the_gate_bit_may_be_given_as_0(loaded: Callable[..., Config]) -> None:
-    extra = ", seal: {area: coils, address: 7}, initial: v.csv"
-    plant = loaded(SMALL % extra, v_csv="coils,7,0\n").memories["plant"]
-    assert plant.initial_values == (InitialRun("coils", 7, (0,)),)
+@pytest.mark.parametrize("mode", ["once", "level"])
+@pytest.mark.parametrize("gate", [0, 1])
+def test_a_memory_starts_sealed_whatever_its_gate_bit_was(
+    loaded: Callable[..., Config], mode: str, gate: int
+) -> None:
+    extra = f", seal: {{area: coils, address: 7, mode: {mode}}}, initial: v.csv"
+    values = f"coils,6,1\ncoils,7,{gate}\nholding_registers,7,1\n"
+    config = loaded(SMALL % f"{extra}, holding_registers: 8", v_csv=values)
+    found = [each.message for each in config.warnings if each.key.endswith(".initial")]
+    warning = "v.csv has 1 in the gate bit of the seal, taken as 0: the memory starts sealed"
+    assert found == [warning] * gate
+    bits, registers = config.memories["plant"].initial_values
+    assert (bits, registers) == (
+        InitialRun("coils", 6, (1, 0)),
+        InitialRun("holding_registers", 7, (1,)),
+    )
 
 
 def test_all_65536_values_of_an_area_can_be_given(loaded: Callable[..., Config]) -> None:

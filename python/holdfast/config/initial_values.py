@@ -20,7 +20,7 @@ from holdfast.runtime.text import extent, listing, suggestion
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
 KINDS = (".csv", ".yaml", ".yml")
 MAX_CSV_BYTES = 8 << 20
@@ -66,14 +66,13 @@ def read(path: Path, file: str, areas: Mapping[str, range | None]) -> str:
 
 
 def parse(
-    text: str, file: str, areas: Mapping[str, range | None], gate: Cell | None
+    text: str, file: str, areas: Mapping[str, range | None]
 ) -> tuple[tuple[InitialRun, ...], list[Problem]]:
     """Returns the values of a file as runs, and the problems of the file.
 
-    `areas` are the areas and files of the memory; addresses of `None` allow any address. `gate` is
-    the gate bit of the seal, which must stay 0.
+    `areas` are the areas and files of the memory; addresses of `None` allow any address.
     """
-    judge = _Judge(file, areas, gate)
+    judge = _Judge(file, areas)
     try:
         for given in (
             _csv(text, judge) if Path(file).suffix.lower() == ".csv" else _yaml(text, judge)
@@ -82,6 +81,17 @@ def parse(
     except ConfigError as error:
         judge.problems += error.problems
     return tuple(judge.runs()), judge.problems
+
+
+def sealed(runs: Iterable[InitialRun], gate: Cell) -> tuple[InitialRun, ...]:
+    """The values with 0 in the gate bit of the seal: what was exported may be of an open one."""
+    area, address = gate
+    return tuple(
+        run._replace(values=(*run.values[:at], 0, *run.values[at + 1 :]))
+        if run.area == area and 0 <= (at := address - run.address) < len(run.values)
+        else run
+        for run in runs
+    )
 
 
 def _counts(areas: Mapping[str, range | None]) -> list[int]:
@@ -94,7 +104,6 @@ class _Judge:
 
     file: str
     areas: Mapping[str, range | None]
-    gate: Cell | None
     problems: list[Problem] = field(default_factory=list)
     kept: dict[str, dict[int, tuple[int, int]]] = field(default_factory=dict)
 
@@ -122,18 +131,16 @@ class _Judge:
         if not isinstance(address, int) or address not in addresses:
             allowed = f"allowed in {area}: {extent(addresses)}"
             raise ValueError(f"found address {show(address)}, {allowed}")
-        value = self._value(area, address, given.value)
+        value = self._value(area, given.value)
         if address in self.kept.get(area, {}):
             line = self.kept[area][address][1]
             raise ValueError(f"duplicate {area} {address}, first in line {line}")
         return area, address, value
 
-    def _value(self, area: str, address: int, value: object) -> int:
+    def _value(self, area: str, value: object) -> int:
         most, to = (1, "or") if area in BIT_AREAS else (MAX_WORD, "to")
         if type(value) is not int or not 0 <= value <= most:
             raise ValueError(f"found {show(value)}, allowed in {area}: 0 {to} {most}")
-        if (area, address) == self.gate and value == 1:
-            raise ValueError("found 1 in the gate bit of the seal, allowed: 0")
         return value
 
     def runs(self) -> Iterator[InitialRun]:

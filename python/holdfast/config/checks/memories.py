@@ -140,7 +140,13 @@ def _check_initial(scope: Scope, path: KeyPath, memory: MemoryConfig) -> None:
     except ConfigError as error:
         report.add(path, f"found {show(file)}, which {error.problems[0].message}")
         return
-    runs, problems = initial_values.parse(text, shown, places, gate)
+    runs, problems = initial_values.parse(text, shown, places)
+    if gate is not None:
+        taken = initial_values.sealed(runs, gate)
+        if taken != runs:
+            taken_as = "taken as 0: the memory starts sealed"
+            report.warn(path, f"{file} has 1 in the gate bit of the seal, {taken_as}")
+        runs = taken
     memory.with_initial_values(runs)
     report.elsewhere += problems
 
