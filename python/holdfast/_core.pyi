@@ -278,12 +278,11 @@ class Stale(OSError):
 
 @final
 class MirrorAge:
-    """How old the values of a range are: a write of the poller to the whole range renews them.
+    """How old the values of a range are: the device that has it as a destination renews it.
 
-    Values that were read under another lease are of another device, and so are those without a
-    lease from before this was made: they renew nothing. Values are stale `after` seconds, and
-    before the first write. With `refuses`, a memory refuses to read and write them then.
-    Thread-safe; the time goes on while the machine is suspended.
+    With a `lease`, so do the values that a log brings from that device, read by any node. Values
+    are stale `after` seconds, and before the first read. With `refuses`, a memory refuses to read
+    and write them then. Thread-safe; the time goes on while the machine is suspended.
     """
 
     def __new__(cls, after: float, *, refuses: bool, lease: int | None = ...) -> MirrorAge: ...
@@ -1317,17 +1316,18 @@ class LogReader:
 class PolledDevice:
     """A device to poll: reads, interval and destinations.
 
-    `reads` are areas, addresses, counts and destinations (memory, area, address) or `None`.
-    `max_gap` (default: 0) or `cost` (of a request, of a register or 16 bits) selects the gaps that
-    are read; `readable` and `forbidden` are areas with start and end, exclusive. `status` is the
-    memory of the status block, and the block. `start_within` is the maximum delay of the first poll
-    (default: the interval). `report` takes the polls; `fields` are areas, addresses and counts that
-    are read only for it, and not forwarded. `release` closes the
-    connection after each poll. With `measured`, measurements replace `cost` after a while. `retry`
-    are the first and the longest pause after failures (default: `RETRY_PAUSES_S`). With `jitter`,
-    they are up to a quarter shorter, and the device is retried at the next time of its schedule;
-    without, when they end. With a `fence`, the device is polled and written to while that is open;
-    devices of one link have the same. Times are in seconds; interval 0 polls without a pause.
+    `reads` are areas, addresses, counts and destinations or `None`; a destination is memory, area
+    and address, and the age of its values or `None`. `max_gap` (default: 0) or `cost` (of a
+    request, of a register or 16 bits) selects the gaps that are read; `readable` and `forbidden`
+    are areas with start and end, exclusive. `status` is the memory of the status block, and the
+    block. `start_within` is the maximum delay of the first poll (default: the interval). `report`
+    takes the polls; `fields` are areas, addresses and counts that are read only for it, and not
+    forwarded. `release` closes the connection after each poll. With `measured`, measurements
+    replace `cost` after a while. `retry` are the first and the longest pause after failures
+    (default: `RETRY_PAUSES_S`). With `jitter`, they are up to a quarter shorter, and the device is
+    retried at the next time of its schedule; without, when they end. With a `fence`, the device is
+    polled and written to while that is open; devices of one link have the same. Times are in
+    seconds; interval 0 polls without a pause.
     """
 
     def __new__(
@@ -1338,7 +1338,7 @@ class PolledDevice:
         unit: int,
         interval: float,
         timeout: float,
-        reads: Sequence[tuple[Area, int, int, tuple[Memory, Area, int] | None]],
+        reads: Sequence[tuple[Area, int, int, tuple[Memory, Area, int, MirrorAge | None] | None]],
         max_gap: int | None = None,
         cost: tuple[float, float] | None = None,
         max_registers: int = ...,

@@ -24,6 +24,7 @@ use crate::heartbeat;
 use crate::lease_fence::Fence;
 use crate::link::{self, Link, Passage};
 use crate::memory::{Memory, named};
+use crate::mirror_age::MirrorAge;
 
 const MAX_REGISTERS: i128 = limit::READ_REGISTERS as i128;
 const MAX_BITS: i128 = limit::READ_BITS as i128;
@@ -31,11 +32,11 @@ const MAX_BITS: i128 = limit::READ_BITS as i128;
 /// An area, the first address of a range, and the address after its last.
 type Range = (String, u32, u32);
 
-/// A memory, an area and an address.
-type MemoryAddress<'py> = (PyRef<'py, Memory>, String, u16);
+/// A memory, an area and an address, and the age of the values there.
+type Target<'py> = (PyRef<'py, Memory>, String, u16, Option<PyRef<'py, MirrorAge>>);
 
 /// An area, an address, a count, and the destination of the bytes.
-type Read<'py> = (String, i128, i128, Option<MemoryAddress<'py>>);
+type Read<'py> = (String, i128, i128, Option<Target<'py>>);
 
 /// Area and slot of a status block, its name, and whether it keeps the last error.
 type StatusBlock = (String, u16, String, bool);
@@ -311,8 +312,9 @@ pub fn plan_blocks(
         .collect())
 }
 
-fn destination((memory, area, address): MemoryAddress<'_>) -> PyResult<Destination> {
-    Ok(Destination { memory: Arc::clone(&memory.core), area: named(&area)?, address })
+fn destination((memory, area, address, age): Target<'_>) -> PyResult<Destination> {
+    let age = age.map(|age| Arc::clone(&age.core));
+    Ok(Destination { memory: Arc::clone(&memory.core), area: named(&area)?, address, age })
 }
 
 /// Writes the status block of a device that is not polled.

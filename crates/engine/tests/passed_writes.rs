@@ -86,7 +86,12 @@ fn settings(name: &str, address: SocketAddr, memory: &Arc<Memory>) -> DeviceSett
             area: AREA,
             address: 0,
             count: 5,
-            into: Some(Destination { memory: Arc::clone(memory), area: AREA, address: 0 }),
+            into: Some(Destination {
+                memory: Arc::clone(memory),
+                area: AREA,
+                address: 0,
+                age: None,
+            }),
             forward: false,
         }],
         limits: PlanLimits::default(),

@@ -1,8 +1,11 @@
 //! What is read from a device, and where it goes.
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use holdfast_memory::{Area, Memory, Write};
+
+use super::mirror_age::MirrorAge;
 
 #[derive(Debug, Clone)]
 pub struct ReadSettings {
@@ -16,12 +19,30 @@ pub struct ReadSettings {
     pub forward: bool,
 }
 
+impl ReadSettings {
+    /// The time of the clock of its age, if that is watched.
+    pub(super) fn now(&self) -> Option<Duration> {
+        self.into.as_ref()?.age.as_ref().map(|age| age.now())
+    }
+}
+
 /// A range of a memory.
 #[derive(Debug, Clone)]
 pub struct Destination {
     pub memory: Arc<Memory>,
     pub area: Area,
     pub address: u16,
+    /// Renewed by what is read into it, if its age is watched.
+    pub age: Option<Arc<MirrorAge>>,
+}
+
+/// What is read into memories, and where to. Another age is that of values from elsewhere.
+pub(super) fn mirrors(reads: &[ReadSettings]) -> impl Iterator<Item = impl PartialEq> {
+    reads.iter().filter_map(|read| {
+        let Destination { memory, area, address, age } = read.into.as_ref()?;
+        let into = (Arc::as_ptr(memory), *area, *address, age.as_ref().map(Arc::as_ptr));
+        Some((read.area, read.address, read.count, into))
+    })
 }
 
 impl Destination {

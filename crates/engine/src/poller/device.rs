@@ -25,7 +25,7 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
 use super::cost::Samples;
-use super::destination::{Destination, ReadSettings};
+use super::destination::{ReadSettings, mirrors};
 use super::forwarding::{Forward, ForwardSettings};
 use super::learned_limits::{Learned, Unreadable};
 use super::panic_guard::{Panicked, catch};
@@ -68,17 +68,6 @@ pub struct DeviceSettings {
     pub release: bool,
     /// Until when the device may be used. Devices of one link have the same, or none.
     pub fence: Option<Arc<Fence>>,
-}
-
-impl DeviceSettings {
-    /// What is read into memories, and where to.
-    fn mirrors(&self) -> impl Iterator<Item = impl PartialEq> + '_ {
-        self.reads.iter().filter_map(|read| {
-            let Destination { memory, area, address } = read.into.as_ref()?;
-            let into = (Arc::as_ptr(memory), *area, *address);
-            Some((read.area, read.address, read.count, into))
-        })
-    }
 }
 
 #[cfg(test)]
@@ -389,7 +378,8 @@ impl Device {
 
     /// Whether its values have another source or place than those of its successor.
     fn is_moved(&self, successor: &Device) -> bool {
-        self.has_other_source(successor) || self.settings.mirrors().ne(successor.settings.mirrors())
+        self.has_other_source(successor)
+            || mirrors(&self.settings.reads).ne(mirrors(&successor.settings.reads))
     }
 
     fn has_other_source(&self, other: &Device) -> bool {
@@ -661,21 +651,26 @@ impl Device {
             let whole = settings.count == u32::from(field.count);
             if whole && !field.area.is_bits() {
                 let end = offset + usize::from(field.count);
-                self.hand_on(read, &bytes[offset * 2..end * 2]);
-            } else if let Some(bytes) =
+                self.hand_on(read, &bytes[offset * 2..end * 2], settings.now());
+            } else if let Some(Partial { bytes, since, .. }) =
                 gathered.put(&self.turn, (read, settings), at, field, (bytes, offset))
             {
-                self.hand_on(read, &bytes);
+                self.hand_on(read, &bytes, since);
             }
         }
     }
 
-    fn hand_on(&self, index: usize, bytes: &[u8]) {
+    /// `since` is when the values arrived, as [`ReadSettings::now`].
+    fn hand_on(&self, index: usize, bytes: &[u8], since: Option<Duration>) {
         let read = &self.settings.reads[index];
         let (mut area, mut address, mut stored) = (read.area, read.address, Ok(()));
         if let Some(into) = &read.into {
             (area, address) = (into.area, into.address);
-            stored = self.store(&into.memory, Access::Mirror, into.writing(read.count, bytes));
+            let age = into.age.clone().zip(since);
+            // Called after the write, so that the values before it are never taken for fresh.
+            let renew = move || age.into_iter().for_each(|(age, since)| age.renew_since(since));
+            let write = into.writing(read.count, bytes);
+            stored = self.store(&into.memory, Access::Mirror, write, renew);
         }
         match stored {
             Ok(()) => {
@@ -695,16 +690,22 @@ impl Device {
     }
 
     /// Writes what was read from the device. This doesn't wait for the journal of a memory, because the other
-    /// devices of the thread would wait too: what the journal refuses is counted later.
-    fn store(&self, memory: &Memory, access: Access, write: Write<'_>) -> Result<(), Refusal> {
+    /// devices of the thread would wait too: what the journal refuses is counted later. Calls `stored` once memory
+    /// has the values.
+    fn store(
+        &self,
+        memory: &Memory,
+        access: Access,
+        write: Write<'_>,
+        stored: impl FnOnce() + Send + 'static,
+    ) -> Result<(), Refusal> {
         if !memory.has_journal() {
-            return memory.write(access, write);
+            return memory.write(access, write).map(|()| stored());
         }
         let state = Arc::clone(&self.state);
-        let done = Box::new(move |outcome: Outcome| {
-            if outcome.is_err() {
-                state.count_unstored();
-            }
+        let done = Box::new(move |outcome: Outcome| match outcome {
+            Ok(_) => stored(),
+            Err(_) => state.count_unstored(),
         });
         submit_under(self.settings.fence.as_ref(), memory, access, write, done)
     }
@@ -719,7 +720,9 @@ impl Device {
         let (status, without_lease) = (self.state.status(), self.is_without_lease());
         if let Some(to) = &self.settings.status
             && !(without_lease && to.memory.is_replicated())
-            && status.write_by(to, |write| self.store(&to.memory, Access::Ingest, write)).is_err()
+            && status
+                .write_by(to, |write| self.store(&to.memory, Access::Ingest, write, || ()))
+                .is_err()
         {
             self.state.count_unstored();
         }
@@ -751,6 +754,8 @@ pub(super) struct Gathered {
 /// A read of which some items have been read.
 struct Partial {
     bytes: Vec<u8>,
+    /// When the first of them arrived, as [`ReadSettings::now`].
+    since: Option<Duration>,
     /// The number of items that have not been read.
     missing: u32,
     /// How many of the changes of the current poll are in it.
@@ -774,10 +779,11 @@ impl Gathered {
         at: u32,
         field: Field,
         (block, offset): (&[u8], usize),
-    ) -> Option<Vec<u8>> {
+    ) -> Option<Partial> {
         let ReadSettings { area, address, count: all, .. } = *settings;
         let partial = self.parts.entry(read).or_insert_with(|| Partial {
             bytes: vec![0; area.byte_len(all as usize)],
+            since: settings.now(),
             missing: all,
             known_changes: 0,
         });
@@ -791,7 +797,7 @@ impl Gathered {
         if partial.missing > 0 {
             return None;
         }
-        self.parts.remove(&read).map(|partial| partial.bytes)
+        self.parts.remove(&read)
     }
 }
 

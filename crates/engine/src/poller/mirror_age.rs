@@ -1,5 +1,9 @@
 //! The age of values that are read from a device. Each reader compares the time, so values become stale
 //! even if the poller hangs.
+//!
+//! What renews an age must know whose values they are: a range may have those of another device until a reload
+//! has reached the poller. So the device that has an age in its [`Destination`](super::Destination)
+//! renews it, and on other nodes the lease of the device does.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
@@ -43,17 +47,28 @@ impl MirrorAge {
         self.refuses.store(refuses, Ordering::Relaxed);
     }
 
+    /// The time of its clock.
+    pub(super) fn now(&self) -> Duration {
+        (self.clock)()
+    }
+
+    /// The range has values that its device has sent at this time of [`now`](MirrorAge::now), or later.
+    pub(super) fn renew_since(&self, time: Duration) {
+        // Values that are written later are no older, also if less is known of their age.
+        self.renewed.fetch_max(nanos(time).max(1), Ordering::Relaxed);
+    }
+
     /// The age of the last values, if there are any.
     pub fn age(&self) -> Option<Duration> {
         let renewed = Some(self.renewed.load(Ordering::Relaxed)).filter(|renewed| *renewed > 0)?;
-        Some((self.clock)().saturating_sub(Duration::from_nanos(renewed)))
+        Some(self.now().saturating_sub(Duration::from_nanos(renewed)))
     }
 
     /// For how long the values have been stale; `None` if they are not.
     pub fn stale_for(&self) -> Option<Duration> {
         let after = Duration::from_nanos(self.after.load(Ordering::Relaxed));
         match self.age() {
-            None => Some((self.clock)().saturating_sub(self.began)),
+            None => Some(self.now().saturating_sub(self.began)),
             Some(age) => age.checked_sub(after),
         }
     }
@@ -61,18 +76,10 @@ impl MirrorAge {
 
 impl Freshness for MirrorAge {
     fn renew(&self, age: Duration, lease: Option<u64>) {
-        let known = (self.clock)().saturating_sub(age);
-        // Before a reload, or on a node that is not reloaded yet, another device may be read into the range.
-        // A lease tells; without one, values from before the range was of this device are not of it.
-        let is_of_device = match self.lease.zip(lease) {
-            Some((own, other)) => own == other,
-            None => known >= self.began,
-        };
-        if !is_of_device {
-            return;
+        // A node that is not reloaded yet may read another device into the range.
+        if lease.is_some() && self.lease == lease {
+            self.renew_since(self.now().saturating_sub(age));
         }
-        // Values that are written later are no older, also if less is known of their age.
-        self.renewed.fetch_max(nanos(known).max(1), Ordering::Relaxed);
     }
 
     fn is_stale(&self) -> bool {
@@ -111,7 +118,7 @@ mod tests {
         pass(3);
         assert_eq!((age.age(), age.stale_for()), (None, Some(Duration::from_secs(3))));
         assert!(age.is_stale());
-        age.renew(Duration::ZERO, None);
+        age.renew_since(age.now());
         assert_eq!((age.age(), age.stale_for()), (Some(Duration::ZERO), None));
         pass(9);
         assert!(!age.is_stale());
@@ -122,7 +129,7 @@ mod tests {
         assert!(!age.is_stale());
         pass(60);
         assert!(age.is_stale());
-        age.renew(Duration::ZERO, None);
+        age.renew_since(age.now());
         assert!(!age.is_stale());
     }
 
@@ -130,12 +137,12 @@ mod tests {
     fn values_are_as_old_as_they_were_when_they_came() {
         let age = of(true);
         pass(8);
-        age.renew(Duration::from_secs(8), None);
+        age.renew(Duration::from_secs(8), Some(LEASE));
         assert_eq!((age.age(), age.is_stale()), (Some(Duration::from_secs(8)), false));
         pass(2);
         assert!(age.is_stale());
-        age.renew(Duration::from_secs(3), None);
-        age.renew(Duration::from_secs(9), None);
+        age.renew_since(age.now() - Duration::from_secs(3));
+        age.renew(Duration::from_secs(9), Some(LEASE));
         assert_eq!(age.age(), Some(Duration::from_secs(3)), "later values are no older");
     }
 
@@ -144,9 +151,8 @@ mod tests {
         let age = of(true);
         age.renew(Duration::ZERO, Some(LEASE + 1));
         assert!(age.is_stale(), "another node reads another device into the range");
-        pass(3);
-        age.renew(Duration::from_secs(4), None);
-        assert!(age.is_stale(), "they were read before the range was of this device");
+        age.renew(Duration::ZERO, None);
+        assert!(age.is_stale(), "they may be of the device before this one");
         age.renew(Duration::from_secs(4), Some(LEASE));
         assert!(!age.is_stale(), "a node that follows knows only how old they are at most");
     }

@@ -863,7 +863,7 @@ mod tests {
         for (area, address) in
             [(AREA, 9), (AREA, 77), (Area::InputRegisters, 10), (Area::Coils, 10)]
         {
-            let into = Some(Destination { memory: memory(), area, address });
+            let into = Some(Destination { memory: memory(), area, address, age: None });
             let expected = "device meter: read 0 does not fit into its destination";
             assert_eq!(refused(|device| device.reads[0].into = into), expected);
         }
@@ -894,7 +894,8 @@ mod tests {
         fits.forward = vec![near, forward(0, Some(block(AREA, 2183)))];
         assert!(checked(fits).is_ok());
         let mut fits = settings();
-        fits.reads[0].into = Some(Destination { memory: memory(), area: AREA, address: 76 });
+        fits.reads[0].into =
+            Some(Destination { memory: memory(), area: AREA, address: 76, age: None });
         fits.status = Some(StatusSettings { memory: memory(), block: block(AREA, 1) });
         assert!(checked(fits).is_ok());
     }

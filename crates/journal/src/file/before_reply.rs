@@ -66,9 +66,8 @@ impl BeforeReply {
             self.restore_shadows();
             return self.queue.refuse(steps.into_iter().map(|each| each.done), Refusal::NotStored);
         }
-        for (Waiting { step, done, since }, expected) in steps.into_iter().zip(outcomes) {
-            // The disk may have taken its time.
-            let outcome = step.carry_out_late(&self.memories, Some(since.elapsed()));
+        for (Waiting { step, done }, expected) in steps.into_iter().zip(outcomes) {
+            let outcome = step.carry_out(&self.memories);
             debug_assert_eq!(outcome, expected, "a step does the same to equal memories");
             done(outcome);
         }

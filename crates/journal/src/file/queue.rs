@@ -3,18 +3,17 @@
 use std::mem;
 use std::process;
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use holdfast_memory::{Action, Done, Journal, Memory, Refusal, Refused, Step};
 use holdfast_runtime::lock;
 
 use super::status::Status;
 
-/// A step, the receiver of its outcome, and since when it waits.
+/// A step, and the receiver of its outcome.
 pub(super) struct Waiting {
     pub step: Step,
     pub done: Done,
-    pub since: Instant,
 }
 
 /// The journal of the memories of a file.
@@ -158,7 +157,7 @@ impl Journal for Queue {
                 // A step that is larger than the queue waits alone.
                 if fits || state.waiting.is_empty() {
                     state.bytes = bytes;
-                    state.waiting.push(Waiting { step, done, since: Instant::now() });
+                    state.waiting.push(Waiting { step, done });
                     drop(state);
                     return self.changed.notify_one();
                 }

@@ -87,9 +87,7 @@ class Devices(Part):
             plan.links = native_links.links(config, plan.memories, poller)
         results = None if values is None else values.results
         made = {
-            name: native_devices.device(
-                name, config, plan.memories, results, self._leases.fence(name, config)
-            )
+            name: native_devices.device(name, plan, results, self._leases.fence(name, config))
             for name in config.devices
             if name in polled and f"devices.{name}" in plan.changed
         }

@@ -13,11 +13,11 @@ from holdfast.appliance.parts.part import Part
 from holdfast.events import log_lines
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator
 
-    from holdfast._core import Memory
     from holdfast.appliance.parts.part import Plan
     from holdfast.config import Config
+    from holdfast.config.models.devices import DestinationConfig, StaleConfig
     from holdfast.types import Area
 
 
@@ -36,6 +36,11 @@ class Place:
         return self.area, self.address, self.count
 
 
+def place_of(into: DestinationConfig, count: int) -> Place:
+    """Where a read of that many items goes."""
+    return Place(into.memory, into.area, into.address, count)
+
+
 class Mirror(NamedTuple):
     """A range that a device is read into, whose age is watched."""
 
@@ -43,6 +48,7 @@ class Mirror(NamedTuple):
     source: tuple[object, ...]
     """Where the values come from. If it changes, those in memory are of the old source."""
     place: Place
+    stale: StaleConfig
     age: _core.MirrorAge
 
 
@@ -66,34 +72,43 @@ class Mirrors(Part):
 
     def prepare(self, plan: Plan) -> Callable[[], None]:
         """Reserves the ranges of the configuration before its devices are polled."""
-        return lambda: self.adopt(plan.config, plan.memories)
+        mirrors = tuple(self._mirrors_of(plan.config))
+        plan.ages = {mirror.place: mirror.age for mirror in mirrors}
+        return lambda: self.adopt(plan, mirrors)
 
-    def adopt(self, config: Config, memories: Mapping[str, Memory]) -> None:
-        """Takes over a configuration. Ranges that are read as before keep their age."""
+    def _mirrors_of(self, config: Config) -> Iterator[Mirror]:
+        """The mirrors of a configuration. Ranges that are read as before keep their age."""
         known = {(mirror.source, mirror.place): mirror.age for mirror in self._mirrors}
-        mirrors = []
-        reserved: dict[str, list[tuple[Area, int, int]]] = {}
         for name, device in config.devices.items():
+            if (stale := device.stale) is None:
+                continue
             for read in device.reads:
-                if (into := read.into) is None:
+                if read.into is None:
                     continue
-                place = Place(into.memory, into.area, into.address, read.count)
-                if device.enabled and device.writes != "local":
-                    reserved.setdefault(into.memory, []).append(place.range)
-                if device.stale is None:
-                    continue
-                after, refuses = device.stale.after, device.stale.answer == "exception"
+                place = place_of(read.into, read.count)
                 source = (name, device.url, device.unit, read.area, read.address)
                 age = known.get((source, place))
                 if age is None:
+                    refuses = stale.answer == "exception"
                     lease = _lease_number(config, name, place)
-                    age = _core.MirrorAge(after, refuses=refuses, lease=lease)
-                age.set(after, refuses=refuses)
-                mirrors.append(Mirror(name, source, place, age))
-        for name, memory in memories.items():
+                    age = _core.MirrorAge(stale.after, refuses=refuses, lease=lease)
+                yield Mirror(name, source, place, stale, age)
+
+    def adopt(self, plan: Plan, mirrors: tuple[Mirror, ...]) -> None:
+        """Takes over the mirrors of a configuration."""
+        reserved: dict[str, list[tuple[Area, int, int]]] = {}
+        for device in plan.config.devices.values():
+            if device.enabled and device.writes != "local":
+                for read in device.reads:
+                    if (into := read.into) is not None:
+                        place = place_of(into, read.count)
+                        reserved.setdefault(into.memory, []).append(place.range)
+        for mirror in mirrors:
+            mirror.age.set(mirror.stale.after, refuses=mirror.stale.answer == "exception")
+        for name, memory in plan.memories.items():
             aging = [(*each.place.range, each.age) for each in mirrors if each.place.memory == name]
             memory.mirror(reserved.get(name, []), aging)
-        self._mirrors = tuple(mirrors)
+        self._mirrors = mirrors
         self._stale &= {mirror.place for mirror in mirrors}
 
     def status(self) -> dict[str, list[dict[str, Any]]]:

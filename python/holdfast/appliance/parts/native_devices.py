@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast import _core
+from holdfast.appliance.parts.mirrors import place_of
 from holdfast.appliance.parts.native_links import endpoint_at
 from holdfast.config import read_plans
 from holdfast.polling.readings import Reader
@@ -17,11 +18,11 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast._core import Memory
-    from holdfast.config import Config
+    from holdfast.appliance.parts.part import Plan
     from holdfast.config.models.devices import (
         BlockConfig,
-        DestinationConfig,
         ForwardConfig,
+        ReadConfig,
         StatusConfig,
     )
     from holdfast.types import Area, Forward, StatusBlock
@@ -32,8 +33,7 @@ FIRST_POLL_SPREAD_S = 10.0
 
 def device(
     name: str,
-    config: Config,
-    memories: Mapping[str, Memory],
+    plan: Plan,
     report: _core.Results | None,
     fence: _core.Fence | None = None,
 ) -> _core.PolledDevice:
@@ -41,6 +41,7 @@ def device(
 
     `report` takes the polls of devices with tags. A `fence` stops polls while it is closed.
     """
+    config, memories = plan.config, plan.memories
     settings = config.devices[name]
     fields = list(Reader(name, config.tags(name)).fields)
     status = settings.status
@@ -52,8 +53,7 @@ def device(
         interval=settings.interval,
         timeout=settings.timeout,
         reads=[
-            (read.area, read.address, read.count, _place(read.into, memories))
-            for read in settings.reads
+            (read.area, read.address, read.count, _place(read, plan)) for read in settings.reads
         ],
         forward=[
             (
@@ -98,7 +98,8 @@ def show_disabled(name: str, status: StatusConfig, memories: Mapping[str, Memory
     _core.write_disabled_status(memories[status.memory], _block(name, status))
 
 
-def _place(
-    into: DestinationConfig | None, memories: Mapping[str, Memory]
-) -> tuple[Memory, Area, int] | None:
-    return None if into is None else (memories[into.memory], into.area, into.address)
+def _place(read: ReadConfig, plan: Plan) -> tuple[Memory, Area, int, _core.MirrorAge | None] | None:
+    if (into := read.into) is None:
+        return None
+    age = plan.ages.get(place_of(into, read.count))
+    return plan.memories[into.memory], into.area, into.address, age

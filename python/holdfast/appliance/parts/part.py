@@ -16,7 +16,8 @@ from holdfast.appliance.parts.native_links import Links
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
 
-    from holdfast._core import Memory
+    from holdfast._core import Memory, MirrorAge
+    from holdfast.appliance.parts.mirrors import Place
     from holdfast.config import Config
     from holdfast.types import ThreadHeartbeat
 
@@ -35,6 +36,8 @@ class Plan:
     retries_ports: bool = False
     """Whether a port of HTTP that is in use is no error: it is bound later."""
     links: Links = field(default_factory=Links)
+    ages: Mapping[Place, MirrorAge] = field(default_factory=dict)
+    """The ages of the ranges that devices are read into."""
 
 
 class Part:

@@ -3,7 +3,9 @@
 
 use std::sync::Weak;
 
-use holdfast_memory::{Access, Done, Journal, Layout, Memory, Read, Span, Step, Term};
+use holdfast_memory::{
+    Access, Done, Freshness, Journal, Layout, Memory, Mirrored, Read, Span, Step, Term,
+};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Builder;
@@ -12,11 +14,11 @@ use tokio::time::timeout;
 
 use super::*;
 use crate::client::Place;
-use crate::poller::BlockSettings;
 use crate::poller::health::Health;
 use crate::poller::panic_guard::spawn_guarded;
 use crate::poller::results::Receivers;
 use crate::poller::write_through::Change;
+use crate::poller::{BlockSettings, Destination, MirrorAge};
 
 #[test]
 fn reads_are_split_into_parts_that_fit_into_one_request() {
@@ -109,7 +111,7 @@ fn registers(memory: &Memory) -> Vec<u8> {
 
 /// Settings that read registers 10 to 13 of the device into `address` and the registers after it.
 fn settings(endpoint: Endpoint, memory: &Arc<Memory>, address: u16) -> DeviceSettings {
-    let into = Some(Destination { memory: Arc::clone(memory), area: AREA, address });
+    let into = Some(Destination { memory: Arc::clone(memory), area: AREA, address, age: None });
     let read = ReadSettings { area: AREA, address: 10, count: 4, into, forward: true };
     let (interval, timeout) = (Duration::from_millis(1), TIMEOUT);
     DeviceSettings { interval, timeout, ..DeviceSettings::for_tests(endpoint, vec![read]) }
@@ -151,6 +153,79 @@ fn a_read_that_memory_refuses_is_counted_and_is_an_error() {
         assert_eq!((state.counters.unstored.get(), state.counters.reads.get()), (0, 1));
         assert_eq!(state.health(), Health::Ok);
         assert_eq!(registers(&memory)[72..], [1, 2].repeat(4));
+    });
+}
+
+thread_local! {
+    static NOW: Cell<u64> = const { Cell::new(100) };
+}
+
+/// An age whose clock a test moves.
+fn age() -> Arc<MirrorAge> {
+    let clock = || Duration::from_secs(NOW.get());
+    Arc::new(MirrorAge::new(clock, Duration::from_secs(10), false, None))
+}
+
+#[test]
+fn only_the_device_of_an_age_renews_it() {
+    with_device(async |endpoint| {
+        let (old, new) = (age(), age());
+        let memory = memory();
+        let freshness = Some(Arc::clone(&new) as Arc<dyn Freshness>);
+        // A reload has replaced the age, and has not reached the device yet.
+        memory.mirror(vec![Mirrored { freshness, ..Mirrored::reserved(AREA, 0, 4) }]).unwrap();
+        let into_of = |age: &Arc<MirrorAge>| {
+            let mut settings = settings(endpoint.clone(), &memory, 0);
+            settings.reads[0].into.as_mut().unwrap().age = Some(Arc::clone(age));
+            device(settings).0
+        };
+        into_of(&old).poll(Instant::now()).await;
+        assert_eq!(registers(&memory)[..8], [1, 2].repeat(4));
+        assert_eq!((old.age(), new.age()), (Some(Duration::ZERO), None));
+        into_of(&new).poll(Instant::now()).await;
+        assert_eq!(new.age(), Some(Duration::ZERO));
+    });
+}
+
+#[test]
+fn a_read_of_several_requests_is_as_old_as_its_first_part() {
+    let reply = |_, _| {
+        NOW.set(NOW.get() + 3);
+        Reply::Data
+    };
+    with_replies(reply, async |endpoint| {
+        let age = age();
+        let mut settings = settings(endpoint, &memory(), 0);
+        settings.reads[0].into.as_mut().unwrap().age = Some(Arc::clone(&age));
+        for (max_registers, expected) in [(2, 3), (4, 0)] {
+            let limits = PlanLimits { max_registers, ..PlanLimits::default() };
+            let (device, ..) = device(DeviceSettings { limits, ..settings.clone() });
+            device.poll(Instant::now()).await;
+            assert_eq!(age.age(), Some(Duration::from_secs(expected)));
+        }
+    });
+}
+
+#[test]
+fn values_become_older_while_a_journal_is_slow() {
+    #[derive(Debug)]
+    struct Slow(Weak<Memory>);
+
+    impl Journal for Slow {
+        fn submit(&self, step: Step, done: Done) {
+            NOW.set(NOW.get() + 5);
+            done(step.carry_out(&[self.0.upgrade().unwrap()]));
+        }
+    }
+
+    with_device(async |endpoint| {
+        let (age, memory) = (age(), memory());
+        memory.keep_in(Arc::new(Slow(Arc::downgrade(&memory))), 0);
+        let mut settings = settings(endpoint, &memory, 0);
+        settings.reads[0].into.as_mut().unwrap().age = Some(Arc::clone(&age));
+        let (device, ..) = device(settings);
+        device.poll(Instant::now()).await;
+        assert_eq!(age.age(), Some(Duration::from_secs(5)));
     });
 }
 
