@@ -211,8 +211,8 @@ impl Forward {
         self.queued.notify_one();
     }
 
-    /// Drops the packets that are queued or not confirmed yet: another node has the lease of the device, and
-    /// forwards newer bytes. If the lease comes back, the status block is sent again.
+    /// Drops the packets that are queued or not confirmed yet: another node has the lease of the device and
+    /// forwards newer bytes, or the values come from elsewhere now. The status block is sent again.
     pub(super) fn withdraw(&self) {
         self.waiting.take();
         self.last_status.take();

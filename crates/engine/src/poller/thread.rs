@@ -20,7 +20,7 @@ use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
-use super::destination::ReadSettings;
+use super::destination::{ReadSettings, mirrors};
 use super::device::{Device, DeviceSettings, Inbox, Planned};
 use super::forwarding::{Forward, ForwardCounters, ForwardSettings};
 use super::panic_guard::spawn_guarded;
@@ -579,7 +579,12 @@ impl Running {
 
     fn replace(&mut self, planned: Planned, polled: Polled, link: Rc<Link>, at_once: bool) {
         let settings = &planned.settings;
-        if !Rc::ptr_eq(&self.link, &link) || self.unit_id != settings.unit_id {
+        let is_other = !Rc::ptr_eq(&self.link, &link) || self.unit_id != settings.unit_id;
+        if is_other || mirrors(&self.reads.borrow()).ne(mirrors(&settings.reads)) {
+            // Packets say where values go, and not where they were read.
+            self.forwards.iter().for_each(|running| running.forward.withdraw());
+        }
+        if is_other {
             // Another device: writes that are under way are not its own.
             self.reads.take();
             self.reads = Rc::default();
@@ -793,6 +798,7 @@ fn checked(device: DeviceSettings) -> Result<Planned, PollerError> {
 
 #[cfg(test)]
 mod tests {
+    use std::num::NonZeroU16;
     use std::sync::Arc;
 
     use holdfast_memory::{Area, Layout, Memory, Span};
@@ -963,6 +969,38 @@ mod tests {
                 tokio::task::yield_now().await;
             }
             assert!(!running.forwards[0].task.is_finished());
+        });
+    }
+
+    #[test]
+    fn a_receiver_gets_nothing_that_was_read_elsewhere_before_a_reload() {
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let into = Destination { memory: memory(), area: AREA, address: 10, age: None };
+            let with = |address, unit_id| {
+                let mut device = DeviceSettings { unit_id, ..settings() };
+                device.reads[0] =
+                    ReadSettings { address, into: Some(into.clone()), ..device.reads[0].clone() };
+                device.forward = vec![receiver(1)];
+                checked(device).unwrap()
+            };
+            let mut links = Links::default();
+            let mut link =
+                || links.to(&settings().endpoint, (InFlight::Fixed(1), Retry::default()));
+            let (first, hour) = (with(0, 1), Duration::from_secs(3600));
+            let mut polled = Polled::new(&first.settings, 0, Arc::default());
+            let mut running = Running::start(first, polled.clone(), link(), hour);
+            let forward = Rc::clone(&running.forwards[0].forward);
+            for (address, unit_id, goes_on) in [(0, 1, true), (5, 1, false), (5, 2, false)] {
+                forward.offer(AREA, 10, NonZeroU16::MIN, &[0, 7]);
+                let next = with(address, unit_id);
+                let before = polled;
+                polled = Polled::new(&next.settings, 0, Arc::clone(&before.state));
+                polled.keep_forwards(&before);
+                running.replace(next, polled.clone(), link(), false);
+                assert!(Rc::ptr_eq(&running.forwards[0].forward, &forward));
+                assert_eq!(forward.has_waiting(), goes_on, "{address} {unit_id}");
+            }
         });
     }
 
