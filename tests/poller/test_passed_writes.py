@@ -279,6 +279,29 @@ def test_a_device_that_does_not_answer_is_exception_11(run: Run) -> None:
             assert scada.read_holding_registers(11, 1) == [501]
 
 
+def test_a_device_gets_no_burst_of_old_writes_after_it_was_silent(run: Run) -> None:
+    is_silent = threading.Event()
+    is_silent.set()
+
+    def silent(asked: Asked) -> None:
+        if asked.pdu[0] <= 4 or not is_silent.is_set():
+            asked.answer()
+
+    retry = {"first": 0.5, "most": 0.5}
+    with plc(silent) as source:
+        tolerance = {"retries": 10}
+        appliance = started(run, source, timeout=0.2, retry=retry, tolerance=tolerance)
+        with wire.Connection(endpoint(appliance, "scada")) as scada:
+            write = b"\x06\x00\x0b\x00"
+            codes = [reply[1] for reply in scada.ask_many(write + bytes([n]) for n in range(40))]
+            assert codes[:3] == [11] * 3
+            assert 10 in codes
+            assert codes.count(11) == len(writes_of(source)), "0A: it was not sent"
+            is_silent.clear()
+            wire.until(lambda: scada.ask(write + b"\xff")[0] == 6, "it is tried again")
+        assert writes_of(source)[codes.count(11) :] == [b"\x06\x01\xf5\x00\xff"]
+
+
 def test_a_device_that_has_gone_is_exception_10(run: Run) -> None:
     with plc() as source:
         appliance = started(run, source)

@@ -10,8 +10,9 @@ use holdfast_protocol::pdu::{EncodedRequest, ResponseError};
 use holdfast_runtime::Retry;
 use tokio::time::Instant;
 
-use super::fault::Exchanged;
+use super::fault::{Exchanged, Fault};
 use crate::client::{ClientError, Endpoint, Place, StrayCounters};
+use crate::link::limits::circuit_breaker::{CircuitBreakers, Down};
 use crate::link::limits::permit::Permit;
 use crate::link::scheduling::in_flight::{Alone, InFlight, Pace, Place as Turn};
 use crate::link::scheduling::queue::Priority;
@@ -26,6 +27,8 @@ pub(crate) struct Link {
     pub(super) wire: Wire,
     /// When an address that cannot be reached, or a unit that does not answer, is tried again.
     pub(crate) retry: Retry,
+    /// Of the requests of clients. Polls have pauses of their own.
+    breakers: CircuitBreakers,
     /// Grows whenever a device may have changed by a request.
     pub(super) changes: Cell<u64>,
 }
@@ -48,7 +51,18 @@ impl Link {
             }
             _ => (Wire::Blocking(BlockingLink::new(endpoint, retry)), one),
         };
-        Rc::new(Link { pace: Pace::new(in_flight), wire, retry, changes: Cell::default() })
+        let (pace, breakers) = (Pace::new(in_flight), CircuitBreakers::new(retry));
+        Rc::new(Link { pace, wire, retry, breakers, changes: Cell::default() })
+    }
+
+    /// Whether a request of a client with this function must fail fast.
+    pub(crate) fn admit(&self, unit_id: u8, function: u8) -> Result<(), Down> {
+        self.breakers.check(unit_id, function)
+    }
+
+    /// Notes the outcome of a request of a client that was sent.
+    pub(crate) fn record(&self, of: (u8, u8), outcome: Result<(), Fault>) {
+        self.breakers.record(of, outcome, self.retry_at().is_some());
     }
 
     /// Sends a request of the poller when it is its turn, and waits for the answer. `timeout` does not

@@ -17,8 +17,8 @@ use super::destination::ReadSettings;
 use crate::client::ClientError;
 use crate::items::{Items, touched};
 use crate::link::{
-    Caller, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, Wanted, confirmation,
-    exception, exception_code, exception_in, pending_reply, submit_under,
+    Caller, Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, Wanted,
+    confirmation, exception, exception_code, exception_in, fault, pending_reply, submit_under,
 };
 
 /// The most writes into one memory that wait for devices.
@@ -250,7 +250,10 @@ impl PassedWrite {
         if self.reply.is_unwanted() {
             return Vec::new();
         }
-        if link.retry_at().is_some() || !self.is_mirrored(reads) {
+        let function = self.request.pdu()[0];
+        // What waits for a silent unit must not reach it in a burst when it is back.
+        let is_down = link.admit(unit_id, function).is_err() || link.retry_at().is_some();
+        if is_down || !self.is_mirrored(reads) {
             self.refuse(ExceptionCode::GatewayPathUnavailable);
             return Vec::new();
         }
@@ -293,13 +296,19 @@ impl PassedWrite {
             },
             None => call(&self.request, &of_client).await,
         };
-        match answered {
-            Ok(answer) => return self.confirm(&answer, value, reads, permit).await,
-            // Its client has gone, and it was not sent.
-            Err(error) if matches!(*error, ClientError::Expired) => {}
-            Err(error) => self.reply.send(exception(&self.pdu, exception_code(&error))),
+        let outcome = answered.as_ref().map(drop).map_err(|error| fault(error));
+        // Its client has gone, and it was not sent.
+        if outcome == Err(Fault::Expired) {
+            return Vec::new();
         }
-        Vec::new()
+        link.record((unit_id, function), outcome);
+        match answered {
+            Ok(answer) => self.confirm(&answer, value, reads, permit).await,
+            Err(error) => {
+                self.reply.send(exception(&self.pdu, exception_code(&error)));
+                Vec::new()
+            }
+        }
     }
 
     /// Takes what the device has confirmed into memory, then replies. `value` is what the device holds

@@ -32,7 +32,7 @@ pub(in crate::link) struct CircuitBreakers {
 
 /// What can't be reached while a breaker is open.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::link) enum Down {
+pub(crate) enum Down {
     Address,
     Unit,
 }

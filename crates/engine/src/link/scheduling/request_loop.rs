@@ -14,7 +14,7 @@ use tokio::time::Instant;
 use crate::client::ClientError;
 use crate::link::access::Link;
 use crate::link::fault::{Exchanged, Fault, exception, exception_code, fault};
-use crate::link::limits::circuit_breaker::{CircuitBreakers, Down, OPEN_AFTER_TIMEOUTS};
+use crate::link::limits::circuit_breaker::{Down, OPEN_AFTER_TIMEOUTS};
 use crate::link::limits::permit::{Permit, Wanted};
 use crate::link::route::{Call, LinkSettings, Reply, SharedLink};
 use crate::link::scheduling::shared_reads::{SharedReads, shareable};
@@ -34,10 +34,9 @@ pub(crate) async fn serve(
         shared.connect_counters(link.strays());
     }
     let reads = SharedReads::new(settings.coalesce, settings.cache);
-    let breakers = CircuitBreakers::new(link.retry);
     let order = Arc::<Order>::default();
     let (failures, answered) = Default::default();
-    let serving = Rc::new(Serving { link, order, reads, breakers, failures, answered });
+    let serving = Rc::new(Serving { link, order, reads, failures, answered });
     while let Some(call) = calls.recv().await {
         let Some(shared) = shared.upgrade() else { return };
         spawn_local(Rc::clone(&serving).carry_out(call, shared));
@@ -48,7 +47,6 @@ struct Serving {
     link: Rc<Link>,
     order: Arc<Order>,
     reads: SharedReads,
-    breakers: CircuitBreakers,
     /// Requests in a row that had no answer.
     failures: Cell<u32>,
     /// When the last answer came.
@@ -148,7 +146,7 @@ impl Serving {
         replies: Vec<Reply>,
         shared: &SharedLink,
     ) -> Vec<Reply> {
-        let Err(down) = self.breakers.check(unit_id, request.pdu()[0]) else { return replies };
+        let Err(down) = self.link.admit(unit_id, request.pdu()[0]) else { return replies };
         // Not 0B, after which a write may have been carried out: nothing was sent.
         let pdu = exception(request.pdu(), ExceptionCode::GatewayPathUnavailable.code());
         let error = shared.error().filter(|_| down == Down::Address);
@@ -179,7 +177,7 @@ impl Serving {
         if outcome == Err(Fault::Timeout) && !from_listener && !is_unreachable {
             return;
         }
-        self.breakers.record(of, outcome, is_unreachable);
+        self.link.record(of, outcome);
         match answered {
             Err(error) if !matches!(outcome, Err(Fault::Exception(_))) => {
                 self.failures.set(self.failures.get().saturating_add(1));
