@@ -301,7 +301,9 @@ impl LateReplies {
         let is_broadcast = how == Ended::Broadcast;
         if is_broadcast {
             let same = confirmation(request);
-            self.unanswered.retain(|old| !old.is_broadcast || confirmation(&old.request) != same);
+            self.unanswered.retain(|old| {
+                !old.is_broadcast || old.until > until || confirmation(&old.request) != same
+            });
         }
         if self.unanswered.len() == MAX_UNANSWERED_REQUESTS {
             let oldest = self.unanswered.iter().position(|old| old.is_broadcast);
@@ -322,10 +324,14 @@ impl LateReplies {
         self.unanswered.iter()
     }
 
-    /// Notes the late reply to the request at this place. Returns how long it took.
+    /// Notes the late reply to the request at this place. Returns how long it took; 0 if others may
+    /// follow: copies of it, or the confirmations of a broadcast by other units.
     pub(super) fn late(&mut self, place: usize, now: Time) -> Duration {
         self.has_late = true;
-        if self.unanswered.get(place).is_some_and(|earlier| now < earlier.from) {
+        let may_repeat = |earlier: &Unanswered| {
+            now < if earlier.is_broadcast { earlier.until } else { earlier.from }
+        };
+        if self.unanswered.get(place).is_some_and(may_repeat) {
             return Duration::ZERO;
         }
         let Some(earlier) = self.unanswered.remove(place) else { return Duration::ZERO };
