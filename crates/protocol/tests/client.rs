@@ -10,7 +10,9 @@ use holdfast_protocol::client::{
     InvalidResponse, MAX_STRAY_DATAGRAMS, Strays, TURNAROUND, Ticket, Tolerance, Transport,
 };
 use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
-use holdfast_protocol::pdu::{self, EncodedRequest, Range, Request, Response, ResponseError};
+use holdfast_protocol::pdu::{
+    self, EncodedRequest, Range, Registers, Request, Response, ResponseError,
+};
 use proptest::prelude::*;
 
 fn read() -> Request<'static> {
@@ -728,6 +730,25 @@ fn a_write_with_the_confirmation_of_a_broadcast_waits_until_that_can_not_come() 
 }
 
 #[test]
+fn the_confirmation_of_a_broadcast_may_come_to_the_next_connection_and_after_a_shorter_one() {
+    let write = EncodedRequest::new(&WRITE);
+    let mut client = Client::new(RTU);
+    client.connection.send(0, &write, SECOND, client.now).unwrap();
+    client.outgoing();
+    let past = client.connection.take_past(client.now);
+    client.connection = Connection::new(RTU);
+    client.connection.follow(past);
+    client.connection.send(0, &write, SECOND / 10, client.now).unwrap();
+    client.outgoing();
+    client.after(TURNAROUND);
+    client.send(WRITE);
+    client.after(SECOND - TURNAROUND - SILENCE);
+    assert_eq!(client.outgoing(), []);
+    client.after(SILENCE);
+    assert_eq!(client.outgoing(), rtu_frame(7, &[6, 0, 3, 0, 7]));
+}
+
+#[test]
 fn confirmations_of_a_broadcast_do_not_keep_a_request_waiting_for_ever() {
     let mut client = after_broadcast(RTU);
     client.send(read());
@@ -736,6 +757,40 @@ fn confirmations_of_a_broadcast_do_not_keep_a_request_waiting_for_ever() {
         assert_eq!(client.connection.in_flight(), waiting);
         client.after(SECOND * 4 / 5);
         client.receive(&rtu_frame(8, &[6, 0, 3, 0, 7]));
+    }
+}
+
+#[test]
+fn the_confirmations_and_the_echo_of_a_broadcast_are_no_replies_that_nobody_asked_for() {
+    let registers = Registers::new(&[0, 7]).unwrap();
+    let values = Request::WriteMultipleRegisters { address: 3, registers };
+    for (transport, frame) in [(RTU, rtu_frame as Framed), (ASCII, ascii_frame)] {
+        for (timeout, broadcast, came) in [
+            (SECOND, WRITE, frame(7, &[6, 0, 3, 0, 7])),
+            (SECOND / 100, WRITE, frame(7, &[6, 0, 3, 0, 7])),
+            (SECOND, WRITE, frame(7, &[0x86, 2])),
+            (SECOND, values, frame(7, &[16, 0, 3, 0, 1])),
+            (SECOND, values, frame(0, &[16, 0, 3, 0, 1, 2, 0, 7])),
+        ] {
+            let mut client = Client::new(transport);
+            for value in 0..8 {
+                client.send(read());
+                client.after(GUARD);
+                client.receive(&frame(7, &[3, 2, 0, value]));
+            }
+            let broadcast = EncodedRequest::new(&broadcast);
+            client.connection.send(0, &broadcast, timeout, client.now).unwrap();
+            client.after(SILENCE);
+            client.outgoing();
+            client.after(TURNAROUND / 2);
+            client.receive(&came);
+            client.after(TURNAROUND / 2);
+            assert_eq!(client.got().len(), 9);
+            assert_eq!(client.connection.take_strays(), Strays::default());
+            client.send(read());
+            client.after(SILENCE);
+            assert!(!client.outgoing().is_empty(), "there is no guard time: {came:x?}");
+        }
     }
 }
 

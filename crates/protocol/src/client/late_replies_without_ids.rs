@@ -9,6 +9,7 @@ use core::time::Duration;
 
 use super::Time;
 use super::raised_timeouts::Lateness;
+use super::rtu_and_ascii::TURNAROUND;
 use super::tolerance::{AcceptUnit, Tolerance};
 use crate::pdu::{EncodedRequest, Request};
 
@@ -259,7 +260,8 @@ impl LateReplies {
                     .max(took * (LATENESS_FACTOR - 1))
                     .min(MAX_LATENESS)
             }
-            Ended::Broadcast => sent + timeout,
+            // However short its timeout is, no request is sent before.
+            Ended::Broadcast => sent + timeout.max(TURNAROUND),
             Ended::Damaged => (sent + timeout).min(now + usual.unwrap_or(WAIT_AFTER_DAMAGED_REPLY)),
         }
     }

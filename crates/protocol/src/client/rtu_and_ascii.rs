@@ -200,11 +200,15 @@ impl OneAtATime {
             flights.transmitted(self.late_replies.timeout(unit_id, self.timeout), now);
             self.late_replies.expire(now);
             self.received.clear();
-            let broadcast = flights.first().is_some_and(|flight| flight.unit_id == 0);
-            self.state = if broadcast && self.silence.is_some() {
-                State::Turnaround { until: now + TURNAROUND }
-            } else {
-                State::Sent { echoed: false }
+            let broadcast = flights.first().filter(|flight| flight.unit_id == 0);
+            self.state = match broadcast.filter(|_| self.silence.is_some()) {
+                Some(flight) => {
+                    // Units may confirm it from now on.
+                    let (request, times) = ((0, &flight.request), (now, self.timeout));
+                    self.late_replies.ended(request, times, Ended::Broadcast, now);
+                    State::Turnaround { until: now + TURNAROUND }
+                }
+                None => State::Sent { echoed: false },
             };
         }
     }
@@ -262,9 +266,12 @@ impl OneAtATime {
             self.received.clear();
         }
         self.received.extend_from_slice(&bytes[..bytes.len().min(self.max_received())]);
+        let may_be_echo = matches!(self.state, State::Turnaround { .. })
+            && flights.first().is_some_and(|flight| self.may_be_echo(flight));
+        let echo = if may_be_echo && self.take_echo() { self.frame.len() } else { 0 };
         let late = self.take_late(flights, now);
         if !may_be_surplus {
-            flights.strays.bytes += bytes.len().saturating_sub(late) as u64;
+            flights.strays.bytes += bytes.len().saturating_sub(echo + late) as u64;
         }
         if late == 0 && is_frame(self.framing, &self.received) {
             self.received.clear();
@@ -310,13 +317,16 @@ impl OneAtATime {
     }
 
     /// The length of the reply that `bytes` begin with, if it answers this request. One with an exception
-    /// answers any request of its function, but no broadcast: it may be the reply to the next request.
+    /// answers any request of its function, but no broadcast while another request waits: it may be the reply
+    /// to that.
     fn reply_to(&self, earlier: &Unanswered, pads: bool, bytes: &[u8]) -> Option<usize> {
         let Unanswered { unit_id, ref request, is_broadcast, .. } = *earlier;
         let function = *request.pdu().first()?;
         let is_its = |(unit, pdu): (u8, &[u8])| {
             if is_broadcast {
-                return pdu == confirmation(request);
+                let no_other_waits = !matches!(self.state, State::Sent { .. });
+                let is_exception = pdu.first() == Some(&(function | 0x80));
+                return pdu == confirmation(request) || (no_other_waits && is_exception);
             }
             let is_of_function = pdu.first().is_some_and(|code| code & 0x7F == function);
             // A request that reads another number of bytes may wait for its own reply.
@@ -577,6 +587,13 @@ impl OneAtATime {
         is_detected || self.awaits_echo(flight)
     }
 
+    /// Takes the echo of the request out of the received bytes, with those before it. Returns whether it came.
+    fn take_echo(&mut self) -> bool {
+        let start = self.received.windows(self.frame.len()).position(|bytes| bytes == self.frame);
+        self.received.drain(..start.map_or(0, |start| start + self.frame.len()));
+        start.is_some()
+    }
+
     fn rest(&mut self, now: Time) {
         self.state = State::Idle;
         self.received.clear();
@@ -591,11 +608,6 @@ impl OneAtATime {
     ) {
         if let State::Turnaround { until } = self.state {
             if until <= now {
-                if let Some(flight) = flights.first() {
-                    let times = (flight.sent, self.timeout);
-                    let request = (flight.unit_id, &flight.request);
-                    self.late_replies.ended(request, times, Ended::Broadcast, now);
-                }
                 self.rest(now);
                 flights.finish(Ok(Response::Written), sink);
             }
@@ -631,9 +643,7 @@ impl OneAtATime {
     fn rtu(&mut self, flights: &Flights, echoed: &mut bool) -> Result<Option<Reply>, FrameError> {
         let Some(flight) = flights.first() else { return Ok(None) };
         let may_be_echo = !*echoed && self.may_be_echo(flight);
-        let echo = self.received.windows(self.frame.len()).position(|bytes| bytes == self.frame);
-        if may_be_echo && let Some(start) = echo {
-            self.received.drain(..start + self.frame.len());
+        if may_be_echo && self.take_echo() {
             *echoed = true;
         }
         if self.awaits_echo(flight) && !*echoed {
