@@ -1070,8 +1070,8 @@ class BlockingClient:
     ) -> Any:
         """Sends a request and returns its result: values, bytes, or `None` for a write.
 
-        Raises `holdfast.ModbusError`. `is_cancelled` is asked right before the request is sent,
-        which it is not if the answer is true.
+        Raises `holdfast.ModbusError`. `is_cancelled` is asked until the request is sent,
+        which it is not once the answer is true.
         """
 
     def end_call(self) -> None:

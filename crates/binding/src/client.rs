@@ -353,7 +353,7 @@ impl BlockingClient {
             // Without an answer, nothing is sent.
             Python::attach(|py| is_cancelled.call0(py)?.is_truthy(py)).unwrap_or(true)
         };
-        let to_begin = || {
+        let to_begin = |_| {
             let cancelled = || ClientError::Lost(Lost::Closed(Closed::BySelf));
             if is_cancelled() { Err(cancelled()) } else { Ok(()) }
         };

@@ -81,9 +81,9 @@ struct Call<'r> {
 
 /// What a call depends on.
 pub struct Conditions<'c> {
-    /// Asked before a connection is made for the request, and at the last moment before its first bytes
-    /// are sent.
-    pub to_begin: &'c dyn Fn() -> Result<(), ClientError>,
+    /// Asked before a connection is made for the request, at least every 0.1 s while it waits until it can be
+    /// sent, and, with true, at the last moment before its first bytes are sent.
+    pub to_begin: &'c dyn Fn(bool) -> Result<(), ClientError>,
     /// Asked before bytes are sent, and then at most every 0.1 s. If it is false, the connection is
     /// closed.
     pub to_go_on: Option<&'c dyn Fn() -> bool>,
@@ -120,7 +120,7 @@ impl BlockingClient {
     pub fn interruptible_call<T>(
         &self,
         interrupted: &mut dyn FnMut() -> bool,
-        to_begin: &dyn Fn() -> Result<(), ClientError>,
+        to_begin: &dyn Fn(bool) -> Result<(), ClientError>,
         was_sent: &AtomicBool,
         (unit_id, request): (u8, &EncodedRequest),
         timeout: Duration,
@@ -176,7 +176,7 @@ impl BlockingClient {
         let mut take = Some(take);
         let mut deadline = Instant::now() + timeout;
         loop {
-            if let Err(error) = (conditions.to_begin)() {
+            if let Err(error) = (conditions.to_begin)(false) {
                 if !conditions.may_go_on() {
                     state.end();
                 }
@@ -460,18 +460,32 @@ impl Open {
         let timeout = deadline.saturating_duration_since(now);
         let Call { unit_id, request, attempt, .. } = *call;
         let sent = self.connection.send_again(unit_id, request, timeout, attempt, now - self.epoch);
-        if let Err(why) = sent {
-            // All transaction ids wait for late replies.
-            call.refused = Some(ClientError::new(why.failure(), timeout));
-            self.connection.close(why, sink);
-            return Ok(());
-        }
+        let ticket = match sent {
+            Ok(ticket) => ticket,
+            Err(why) => {
+                // All transaction ids wait for late replies.
+                call.refused = Some(ClientError::new(why.failure(), timeout));
+                self.connection.close(why, sink);
+                return Ok(());
+            }
+        };
         let mut has_begun = false;
         loop {
             let outgoing = self.connection.outgoing();
-            if !outgoing.is_empty() {
-                call.refused = if has_begun { None } else { (call.conditions.to_begin)().err() };
-                if call.refused.is_some() || !call.conditions.may_go_on() {
+            let is_sent = !outgoing.is_empty();
+            // Also while it waits for late replies: the next request may have nothing to wait for.
+            if !has_begun && let Err(error) = (call.conditions.to_begin)(is_sent) {
+                call.refused = Some(error);
+                if !is_sent {
+                    self.connection.cancel(ticket, self.epoch.elapsed());
+                }
+                if self.connection.in_flight() > 0 || !call.conditions.may_go_on() {
+                    self.connection.close(Closed::BySelf, sink);
+                }
+                return Ok(());
+            }
+            if is_sent {
+                if !call.conditions.may_go_on() {
                     self.connection.close(Closed::BySelf, sink);
                     return Ok(());
                 }
@@ -496,7 +510,11 @@ impl Open {
                 return Ok(());
             }
             let until = self.epoch + until;
-            match self.stream.receive(&mut chunk, interrupt.slice(until)) {
+            let slice = match has_begun {
+                true => interrupt.slice(until),
+                false => until.min(Instant::now() + SIGNAL_CHECK_INTERVAL),
+            };
+            match self.stream.receive(&mut chunk, slice) {
                 Ok(len) => {
                     self.connection.receive(&chunk[..len], self.epoch.elapsed(), &mut *sink);
                 }
@@ -525,7 +543,7 @@ mod tests {
 
     use super::*;
 
-    const ANY_TIME: Conditions<'static> = Conditions { to_begin: &|| Ok(()), to_go_on: None };
+    const ANY_TIME: Conditions<'static> = Conditions { to_begin: &|_| Ok(()), to_go_on: None };
 
     /// A stream whose second copy of a reply waits unread when the guard time is over, because the process had no
     /// processor.
@@ -612,16 +630,48 @@ mod tests {
     }
 
     #[test]
+    fn what_may_no_longer_begin_while_it_waits_for_a_late_reply_leaves_the_line_to_the_next_request()
+     {
+        let place = Place::RtuOverTcp { host: String::new(), port: 0 };
+        let client = BlockingClient::new(Endpoint { place, tolerance: Tolerance::default() });
+        let range = Range::new(0, 1).unwrap();
+        let request = EncodedRequest::new(&Request::ReadHoldingRegisters(range));
+        let transport = Transport::SerialRtu { silence: Duration::ZERO };
+        let mut connection = Connection::new(transport);
+        // Its reply may come for 10 s from now on.
+        let timeout = Duration::from_secs(60);
+        connection.send(1, &request, timeout, Duration::ZERO).unwrap();
+        connection.sent(connection.outgoing().len());
+        connection.advance(timeout, |_| {});
+        client.state.lock().unwrap().open = Some(Open {
+            stream: Box::new(Stalled { waiting: VecDeque::new(), copy: None }),
+            connection,
+            transport,
+            epoch: Instant::now() - timeout,
+            used: Instant::now(),
+            late: 0,
+        });
+        let asked = Cell::new(0);
+        let to_begin = |is_sent: bool| {
+            asked.set(asked.get() + 1);
+            if is_sent || asked.get() > 3 { Err(ClientError::Expired) } else { Ok(()) }
+        };
+        let conditions = Conditions { to_begin: &to_begin, to_go_on: None };
+        let answer = client.call(&conditions, 1, &request, timeout, |_, _| ());
+        assert!(matches!(answer, Err(ClientError::Expired)), "{answer:?}");
+        assert_eq!(asked.get(), 4);
+        assert!(client.state.lock().unwrap().open.is_some());
+        let answer = client.call(&ANY_TIME, 2, &request, timeout, |_, pdu| pdu.to_vec());
+        assert_eq!(answer.unwrap(), [3, 2, 0, 0]);
+    }
+
+    #[test]
     fn what_may_no_longer_begin_after_the_connect_is_not_sent() {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let (host, port) = ("127.0.0.1".to_owned(), listener.local_addr().unwrap().port());
         let place = Place::Tcp { host, port, tls: None };
         let client = BlockingClient::new(Endpoint { place, tolerance: Tolerance::default() });
-        let asked = Cell::new(0);
-        let to_begin = || {
-            asked.set(asked.get() + 1);
-            if asked.get() == 1 { Ok(()) } else { Err(ClientError::Expired) }
-        };
+        let to_begin = |is_sent| if is_sent { Err(ClientError::Expired) } else { Ok(()) };
         let conditions = Conditions { to_begin: &to_begin, to_go_on: None };
         let write = EncodedRequest::new(&Request::WriteSingleRegister { address: 0, value: 1 });
         let answer = client.call(&conditions, 1, &write, Duration::from_secs(60), |_, _| ());

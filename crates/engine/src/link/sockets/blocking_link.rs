@@ -130,7 +130,7 @@ fn carried_out(client: &BlockingClient, call: &Call, pause: &ConnectPause) -> Ex
     let Call { unit_id, ref request, timeout, ref permit, .. } = *call;
     let allows = permit.fence.as_ref().map(|fence| || fence.allows());
     let conditions = Conditions {
-        to_begin: &|| permit.check(true),
+        to_begin: &|is_sent| permit.check(is_sent),
         to_go_on: allows.as_ref().map(|allows| allows as &dyn Fn() -> bool),
     };
     let answer = client.call(&conditions, unit_id, request, timeout, |_, pdu| pdu.to_vec());
