@@ -188,7 +188,7 @@ fn steps_that_wait_are_stored_together() {
     let mut coming = vec![submit(&one, 0, 1)];
     until("the first step", || disk.is_blocking());
     coming.extend((1..500).map(|address| submit(&one, address, 1)));
-    assert_eq!(file.status().pending, 499);
+    assert_eq!(file.status().pending, 500);
     assert_eq!(get(&one, 0), 0, "nothing changes before it is stored");
     disk.hold(false);
     for outcome in coming {

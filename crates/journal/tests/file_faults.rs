@@ -295,3 +295,27 @@ fn a_thread_that_panics_leaves_nobody_waiting() {
     assert!(file.status().failing.unwrap().contains("panicked"));
     file.stop().unwrap_err();
 }
+
+#[test]
+fn a_disk_that_does_not_answer_is_an_error_until_it_does() {
+    for sync in [0, 1].map(Duration::from_millis) {
+        let disk = Arc::new(SimDisk::default());
+        let one = memory(layout(0, 1000), None);
+        let options = Options { patience: Duration::from_millis(1), ..Options::new(sync) };
+        let file = keep(&disk, &[("one", &one)], options).unwrap();
+        disk.hold(true);
+        let writing = std::thread::spawn({
+            let one = Arc::clone(&one);
+            move || set(&one, 0, 7)
+        });
+        let expected = Some("the disk has not answered for 0.001 s");
+        until("the error", || {
+            let status = file.status();
+            status.failing.as_deref() == expected && status.pending == 1
+        });
+        disk.hold(false);
+        writing.join().unwrap().unwrap();
+        until("recovery", || file.status().failing.is_none() && file.status().pending == 0);
+        assert_eq!(get(&stored(&disk), 0), 7);
+    }
+}

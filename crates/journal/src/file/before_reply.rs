@@ -40,9 +40,9 @@ impl BeforeReply {
     pub fn run(mut self) -> Result<(), FileError> {
         self.restore_shadows();
         loop {
-            match self.queue.next(self.store.in_doubt().then_some(self.retry)) {
+            match self.queue.next(self.retry) {
                 Next::Steps(steps) => self.carry_out(steps),
-                // The status has the error, and the next attempt may succeed.
+                // The file may be in doubt. The status has the error of an attempt.
                 Next::Idle => drop(self.store.store(Changes::default())),
                 Next::Stop => return self.store.close(),
             }
@@ -62,7 +62,9 @@ impl BeforeReply {
         }
         let pages = touched.into_iter().filter_map(|place| self.changed(place)).collect();
         // The memories have not changed yet: only the shadows are ahead.
-        if self.store.store(Changes { pages, ..Changes::default() }).is_err() {
+        let stored = self.store.store(Changes { pages, ..Changes::default() });
+        self.queue.stored();
+        if stored.is_err() {
             self.restore_shadows();
             return self.queue.refuse(steps.into_iter().map(|each| each.done), Refusal::NotStored);
         }

@@ -39,11 +39,19 @@ pub struct Options {
     pub max_bytes: usize,
     /// How long after an I/O error the next attempt follows if there is no step.
     pub retry: Duration,
+    /// A disk that does not answer for longer is an error in the status.
+    pub patience: Duration,
 }
 
 impl Options {
     pub const fn new(sync: Duration) -> Options {
-        Options { sync, max_steps: 4096, max_bytes: 16 << 20, retry: Duration::from_secs(1) }
+        Options {
+            sync,
+            max_steps: 4096,
+            max_bytes: 16 << 20,
+            retry: Duration::from_secs(1),
+            patience: Duration::from_secs(5),
+        }
     }
 
     /// Whether a write is stored before it is answered.
@@ -229,7 +237,8 @@ impl MemoryFile {
         let thread = thread::Builder::new().name("memory file".to_owned()).spawn(move || {
             let ended = catch_unwind(AssertUnwindSafe(keeping)).unwrap_or_else(|_| {
                 let error = FileError::Io(io::Error::other("the thread that stores has panicked"));
-                lock(&status).failing = Some(error.to_string());
+                let mut status = lock(&status);
+                (status.failing, status.busy_since) = (Some(error.to_string()), None);
                 Err(error)
             });
             queue.end();
@@ -259,13 +268,19 @@ impl MemoryFile {
     }
 
     pub fn status(&self) -> Status {
-        let pending = if self.options.stores_before_reply() {
+        let mut status = lock(&self.status).clone();
+        let written: u64 = self.members.iter().map(|member| member.memory.writes()).sum();
+        status.pending = if self.options.stores_before_reply() {
             self.queue.waiting() as u64
         } else {
-            let written: u64 = self.members.iter().map(|member| member.memory.writes()).sum();
             written.saturating_sub(self.stored_writes.load(Ordering::Relaxed))
         };
-        Status { pending, ..lock(&self.status).clone() }
+        let patience = self.options.patience;
+        if status.busy_since.is_some_and(|since| since.elapsed() > patience) {
+            let text = format!("the disk has not answered for {} s", patience.as_secs_f64());
+            status.failing = Some(text);
+        }
+        status
     }
 
     fn state(&self) -> MutexGuard<'_, State> {

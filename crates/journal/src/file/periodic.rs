@@ -35,7 +35,7 @@ pub(super) struct Periodic {
 
 impl Periodic {
     pub fn run(mut self) -> Result<(), FileError> {
-        while let Next::Idle = self.queue.next(Some(self.sync)) {
+        while let Next::Idle = self.queue.next(self.sync) {
             // The status has the error, and the next attempt may succeed.
             let _ = self.store_changes();
         }

@@ -38,6 +38,8 @@ struct State {
     phase: Phase,
     waiting: Vec<Waiting>,
     bytes: usize,
+    /// How many steps were taken and are not answered: the disk may keep them waiting.
+    taken: usize,
 }
 
 #[derive(Debug)]
@@ -65,8 +67,9 @@ impl Queue {
         limits: QueueLimits,
         status: Arc<Mutex<Status>>,
     ) -> Queue {
-        let state = State { phase: Phase::Loading(memories), waiting: Vec::new(), bytes: 0 };
-        let (state, process) = (Mutex::new(state), process::id());
+        let phase = Phase::Loading(memories);
+        let state = Mutex::new(State { phase, waiting: Vec::new(), bytes: 0, taken: 0 });
+        let process = process::id();
         Queue { state, changed: Condvar::new(), limits, status, process }
     }
 
@@ -95,35 +98,34 @@ impl Queue {
     pub fn end(&self) {
         let mut state = lock(&self.state);
         state.phase = Phase::Ended;
-        state.bytes = 0;
+        (state.bytes, state.taken) = (0, 0);
         let waiting = mem::take(&mut state.waiting);
         drop(state);
         self.refuse(waiting.into_iter().map(|each| each.done), Refusal::Unavailable);
     }
 
     /// Waits until there is something to do, or for this time.
-    pub fn next(&self, timeout: Option<Duration>) -> Next {
+    pub fn next(&self, timeout: Duration) -> Next {
         let is_idle =
             |state: &mut State| state.waiting.is_empty() && matches!(state.phase, Phase::Running);
-        let state = lock(&self.state);
-        let mut state = match timeout {
-            Some(timeout) => {
-                self.changed
-                    .wait_timeout_while(state, timeout, is_idle)
-                    .unwrap_or_else(PoisonError::into_inner)
-                    .0
-            }
-            None => self.changed.wait_while(state, is_idle).unwrap_or_else(PoisonError::into_inner),
-        };
+        let state = self.changed.wait_timeout_while(lock(&self.state), timeout, is_idle);
+        let (mut state, _) = state.unwrap_or_else(PoisonError::into_inner);
         if !state.waiting.is_empty() {
-            state.bytes = 0;
+            (state.bytes, state.taken) = (0, state.waiting.len());
             return Next::Steps(mem::take(&mut state.waiting));
         }
         if is_idle(&mut state) { Next::Idle } else { Next::Stop }
     }
 
+    /// Notes, before they are answered, that the steps that were taken do not wait any more.
+    pub fn stored(&self) {
+        lock(&self.state).taken = 0;
+    }
+
+    /// How many steps wait, also those that are being stored.
     pub fn waiting(&self) -> usize {
-        lock(&self.state).waiting.len()
+        let state = lock(&self.state);
+        state.waiting.len() + state.taken
     }
 
     /// Answers and counts steps that were not carried out.
@@ -182,7 +184,7 @@ fn size(step: &Step) -> usize {
 
 impl std::fmt::Debug for State {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let State { phase, waiting, bytes } = self;
-        write!(f, "{phase:?}, {} steps of {bytes} bytes", waiting.len())
+        let State { phase, waiting, bytes, taken } = self;
+        write!(f, "{phase:?}, {} steps of {bytes} bytes, {taken} taken", waiting.len())
     }
 }

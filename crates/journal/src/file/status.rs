@@ -1,6 +1,6 @@
 //! How storing goes.
 
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 /// How storing goes.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
@@ -21,4 +21,6 @@ pub struct Status {
     pub last_commit: Duration,
     /// The size of the file.
     pub bytes: u64,
+    /// Since when the disk has not answered.
+    pub(super) busy_since: Option<Instant>,
 }

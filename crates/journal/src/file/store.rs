@@ -85,17 +85,21 @@ impl Store {
             return Ok(());
         }
         let began = Instant::now();
+        self.note(|status| status.busy_since = Some(began));
         let stored = self.try_store(changes);
         let bytes = self.bytes();
-        self.note(|status| match &stored {
-            Ok(()) => {
-                status.failing = None;
-                status.stored_at = Some(SystemTime::now());
-                status.commits += 1;
-                status.last_commit = began.elapsed();
-                status.bytes = bytes;
+        self.note(|status| {
+            status.busy_since = None;
+            match &stored {
+                Ok(()) => {
+                    status.failing = None;
+                    status.stored_at = Some(SystemTime::now());
+                    status.commits += 1;
+                    status.last_commit = began.elapsed();
+                    status.bytes = bytes;
+                }
+                Err(error) => status.failing = Some(error.to_string()),
             }
-            Err(error) => status.failing = Some(error.to_string()),
         });
         stored
     }

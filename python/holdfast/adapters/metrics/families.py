@@ -161,7 +161,8 @@ MEMORY_FILE_COUNTERS = {
     "busy": ("memory_file_busy", "Writes refused because too many waited for the disk."),
 }
 MEMORY_FILE_GAUGES = {
-    "is_failing": ("memory_file_failing", "1 if the file could not be written last time."),
+    "is_failing": ("memory_file_failing", "1 while the file can't be written."),
+    "pending": ("memory_file_pending", "Writes that are not on the disk."),
     "stored_at": (
         "memory_file_stored_timestamp_seconds",
         "Unix time of the last write to the disk.",

@@ -94,6 +94,9 @@ class Memories(Part):
 
     def _close(self, path: Path, file: _core.MemoryFile) -> None:
         """Stores pending writes."""
+        # A disk that hangs keeps the stop waiting.
+        if pending := file.status()["pending"]:
+            log_lines.write(logging.INFO, "memory_file_storing", file=path, writes=pending)
         try:
             file.stop()
         except OSError as error:
