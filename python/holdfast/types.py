@@ -141,7 +141,7 @@ class MemoryFileStatus(TypedDict):
     `failing`: why contents can't be stored at present. `stored_at`: when they were last stored, in
     seconds since 1970. `commits`: transactions. `pending`: writes that wait to be stored.
     `refused`: writes that were refused because they could not be stored. `busy`: because too many
-    waited. `bytes`: size of the file.
+    waited. `bytes`: size of the file. `recreated`: how often it was gone, and was written anew.
     """
 
     failing: str | None
@@ -152,6 +152,7 @@ class MemoryFileStatus(TypedDict):
     busy: int
     last_commit_seconds: float
     bytes: int
+    recreated: int
 
 
 class ConnectionCounters(TypedDict):

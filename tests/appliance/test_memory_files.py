@@ -359,6 +359,48 @@ def test_writes_that_the_stop_can_not_store_are_counted(plant: Plant) -> None:
     assert " info stopped" in log
 
 
+@pytest.mark.parametrize("plant", [0, 0.05], indirect=True)
+def test_a_file_that_is_removed_while_it_is_written_is_written_anew(plant: Plant) -> None:
+    file = plant.file.with_name("plant.redb")
+    plant.disk(full=True)
+    plant.modbus("0600030001")
+    plant.until_logged("error memory_file_failing")
+    file.unlink()
+    plant.disk(full=False)
+    plant.until_logged(f"warning memory_file_recreated file={file}")
+    wire.until(lambda: plant.modbus("0600030007") == "0600030007", "it recovers")
+    file.unlink()
+    plant.until_logged("warning memory_file_recreated")
+    file.unlink()
+    code, log = plant.command.end(signal.SIGTERM)
+    assert code == 0
+    assert " warning memory_file_recreated " in log
+    with Appliance(load(plant.file)) as again:
+        assert again.memories["plant"].read("holding_registers", 3, 1) == [7]
+
+
+@pytest.mark.parametrize("plant", [0, 0.05], indirect=True)
+def test_another_file_in_the_place_of_its_own_is_not_changed(plant: Plant) -> None:
+    file, other = (plant.file.with_name(name) for name in ("plant.redb", "other"))
+    plant.disk(full=True)
+    plant.modbus("0600030001")
+    plant.until_logged('error="File too large')
+    other.write_bytes(b"other")
+    other.rename(file)
+    # Another reason is logged too.
+    plant.until_logged('error="another file is in its place')
+    file.rename(other)
+    plant.disk(full=False)
+    plant.until_logged("info memory_file_back")
+    assert plant.modbus("0600030007") == "0600030007"
+    other.rename(file)
+    plant.until_logged('error="another file is in its place')
+    code, log = plant.command.end(signal.SIGTERM)
+    assert code == 1
+    assert " error memory_file_lost " in log
+    assert file.read_bytes() == b"other"
+
+
 def test_a_mirror_is_kept_too(tmp_path: Path) -> None:
     source = holdfast.Memory(holding_registers=10)
     with holdfast.Server({1: source}, bind="127.0.0.1:0", access="read-write") as device:

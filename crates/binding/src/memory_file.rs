@@ -102,6 +102,7 @@ impl MemoryFile {
         shown.set_item("busy", status.busy)?;
         shown.set_item("last_commit_seconds", status.last_commit.as_secs_f64())?;
         shown.set_item("bytes", status.bytes)?;
+        shown.set_item("recreated", status.recreated)?;
         Ok(shown)
     }
 }

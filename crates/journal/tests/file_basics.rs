@@ -123,7 +123,7 @@ fn a_file_that_takes_the_place_of_another_has_its_permissions() {
     std::fs::set_permissions(&path, permissions).unwrap();
     let permissions = std::fs::metadata(&path).unwrap().permissions();
     disk.create(&redb::Database::builder()).unwrap().close().unwrap();
-    disk.install(true).unwrap();
+    disk.install().unwrap();
     assert_eq!(std::fs::metadata(&path).unwrap().permissions(), permissions);
     file.stop().unwrap();
 }

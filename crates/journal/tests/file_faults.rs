@@ -179,6 +179,7 @@ impl Disk for Failing {
     }
 
     fn open(&self, builder: &Builder) -> Result<Database, FileError> {
+        drop(self.disk.open(builder)?);
         let file = std::fs::File::options().read(true).write(true).open(&self.path)?;
         let (file, fails) = (FileBackend::new(file)?, Arc::clone(&self.fails));
         Ok(builder.create_with_backend(FailingBackend { file, fails })?)
@@ -192,8 +193,12 @@ impl Disk for Failing {
         self.disk.create(builder)
     }
 
-    fn install(&self, replace: bool) -> Result<(), FileError> {
-        self.disk.install(replace)
+    fn is_in_place(&self) -> Result<bool, FileError> {
+        self.disk.is_in_place()
+    }
+
+    fn install(&self) -> Result<(), FileError> {
+        self.disk.install()
     }
 
     fn discard(&self) {
@@ -318,4 +323,103 @@ fn a_disk_that_does_not_answer_is_an_error_until_it_does() {
         until("recovery", || file.status().failing.is_none() && file.status().pending == 0);
         assert_eq!(get(&stored(&disk), 0), 7);
     }
+}
+
+/// A file that is kept in a folder of its own, with 1 at address 0.
+#[cfg(unix)]
+fn kept(name: &str, options: Options) -> (PathBuf, Arc<Memory>, MemoryFile) {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).unwrap();
+    let path = folder.join("memories.redb");
+    let one = memory(layout(0, 1000), None);
+    let file = keep(&Arc::new(FileOnDisk::new(&path)), &[("one", &one)], options).unwrap();
+    set(&one, 0, 1).unwrap();
+    (path, one, file)
+}
+
+/// What a start finds, after a kill at this moment.
+#[cfg(unix)]
+fn after_a_kill(path: &Path) -> (u16, u16) {
+    let copy = path.with_extension("copy");
+    std::fs::copy(path, &copy).unwrap();
+    let found = memory(layout(0, 1000), None);
+    keep(&Arc::new(FileOnDisk::new(&copy)), &[("one", &found)], patient()).unwrap();
+    std::fs::remove_file(copy).unwrap();
+    (get(&found, 0), get(&found, 1))
+}
+
+#[cfg(unix)]
+#[test]
+fn a_file_that_is_removed_is_written_anew_before_a_write_is_confirmed() {
+    let (path, one, file) = kept("removed", patient());
+    std::fs::remove_file(&path).unwrap();
+    set(&one, 1, 2).unwrap();
+    assert_eq!(after_a_kill(&path), (1, 2));
+    std::fs::rename(&path, path.with_extension("moved")).unwrap();
+    set(&one, 1, 3).unwrap();
+    assert_eq!(after_a_kill(&path), (1, 3));
+    assert_eq!(after_a_kill(&path.with_extension("moved")), (1, 2));
+    assert_eq!(file.status().recreated, 2);
+    std::fs::remove_file(&path).unwrap();
+    file.stop().unwrap();
+    assert_eq!(after_a_kill(&path), (1, 3));
+}
+
+#[cfg(unix)]
+#[test]
+fn a_file_that_is_removed_is_written_anew_without_a_write() {
+    let soon = Duration::from_millis(1);
+    let options = [Options { retry: soon, ..at_once() }, Options::new(soon)];
+    for (name, options) in ["removed at 0", "removed at 1"].into_iter().zip(options) {
+        let (path, _one, file) = kept(name, options);
+        until("it is stored", || file.status().pending == 0);
+        std::fs::remove_file(&path).unwrap();
+        until("a new file", || file.status().recreated == 1);
+        assert_eq!(after_a_kill(&path), (1, 0));
+        assert_eq!(file.status().failing, None);
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn another_file_is_never_replaced() {
+    let (path, one, file) = kept("another", patient());
+    let (own, other) = (path.with_extension("own"), path.with_extension("other"));
+    std::fs::rename(&path, &own).unwrap();
+    std::fs::write(&path, "other").unwrap();
+    assert_eq!(set(&one, 1, 2), NOT_STORED);
+    assert!(file.status().failing.unwrap().starts_with("another file is in its place."));
+    // The own one is back: it has everything.
+    std::fs::rename(&path, &other).unwrap();
+    std::fs::rename(&own, &path).unwrap();
+    set(&one, 1, 3).unwrap();
+    assert_eq!((file.status().failing, file.status().recreated), (None, 0));
+    std::fs::rename(&other, &path).unwrap();
+    assert_eq!(set(&one, 1, 4), NOT_STORED);
+    assert_eq!(std::fs::read(&path).unwrap(), b"other");
+    std::fs::remove_file(&path).unwrap();
+    set(&one, 0, 5).unwrap();
+    assert_eq!(after_a_kill(&path), (5, 3));
+    std::fs::write(&own, "other").unwrap();
+    std::fs::rename(&own, &path).unwrap();
+    assert!(matches!(file.stop(), Err(FileError::Replaced)));
+    assert!(file.status().pending > 0, "nothing of it is on the disk");
+    assert_eq!(std::fs::read(&path).unwrap(), b"other");
+    assert_eq!(std::fs::read_dir(path.parent().unwrap()).unwrap().count(), 1);
+}
+
+#[cfg(unix)]
+#[test]
+fn a_folder_that_is_gone_refuses_steps_until_it_is_back() {
+    let (path, one, file) = kept("folder", patient());
+    let (folder, moved) = (path.parent().unwrap(), path.parent().unwrap().with_extension("moved"));
+    let _ = std::fs::remove_dir_all(&moved);
+    std::fs::rename(folder, &moved).unwrap();
+    assert_eq!(set(&one, 1, 2), NOT_STORED);
+    assert!(file.status().failing.is_some());
+    std::fs::rename(&moved, folder).unwrap();
+    set(&one, 1, 3).unwrap();
+    assert_eq!(after_a_kill(&path), (1, 3));
+    assert_eq!(file.status().failing, None);
 }

@@ -60,7 +60,8 @@ _MEANINGS: Mapping[tuple[str, str, Outcome], str] = {
         thread_stalled log_contents_dropped log_failed log_digests_differ log_dropped
         events_lost""",
     ("process", "info", "unknown"): "held_back",
-    ("file", "change", "success"): "memory_file_back audit_back audit_copies_back",
+    ("file", "change", "success"): """
+        memory_file_back memory_file_recreated audit_back audit_copies_back""",
     ("file", "change", "failure"): """
         memory_file_failing memory_file_lost audit_failed audit_lost audit_not_rotated
         audit_copy_failed audit_copies_lost""",

@@ -42,7 +42,7 @@ impl BeforeReply {
         loop {
             match self.queue.next(self.retry) {
                 Next::Steps(steps) => self.carry_out(steps),
-                // The file may be in doubt. The status has the error of an attempt.
+                // The file may be gone, or in doubt. The status has the error of an attempt.
                 Next::Idle => drop(self.store.store(Changes::default())),
                 Next::Stop => return self.store.close(),
             }

@@ -4,7 +4,9 @@ use std::fmt;
 use std::fs;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 
+use holdfast_runtime::lock;
 use redb::backends::FileBackend;
 use redb::{Builder, Database};
 
@@ -38,12 +40,19 @@ pub trait Disk: fmt::Debug + Send + Sync {
     /// Those of redb.
     fn create(&self, builder: &Builder) -> Result<Database, FileError>;
 
-    /// Puts what was created in the place of the file, durably. Unless `replace` is set, there must not
-    /// be a file yet.
+    /// Whether the file that was opened or installed last is still there; `false` if there is no file.
     ///
     /// # Errors
-    /// [`FileError::Io`]. The file is the old one or the new one then.
-    fn install(&self, replace: bool) -> Result<(), FileError>;
+    /// [`FileError::Replaced`] if another file is there, and as [`Disk::size`].
+    fn is_in_place(&self) -> Result<bool, FileError>;
+
+    /// Puts what was created in the place of the file, durably. A file that is not the one that was opened
+    /// or installed last is never replaced.
+    ///
+    /// # Errors
+    /// As [`Disk::is_in_place`], and [`FileError::Locked`] if another process has created a file meanwhile.
+    /// The file is the old one or the new one then.
+    fn install(&self) -> Result<(), FileError>;
 
     /// Removes what was created, unless it is in place.
     fn discard(&self);
@@ -57,6 +66,8 @@ pub struct FileOnDisk {
     path: PathBuf,
     /// Is created first. The name is of this process: two that start at once don't share it.
     beside: PathBuf,
+    /// The file that was opened or installed last. While this is open, no other file has its number.
+    opened: Mutex<Option<fs::File>>,
 }
 
 impl FileOnDisk {
@@ -66,7 +77,7 @@ impl FileOnDisk {
         let path = path.unwrap_or_default();
         let mut beside = path.as_os_str().to_owned();
         beside.push(format!(".{}.new", std::process::id()));
-        FileOnDisk { path, beside: beside.into() }
+        FileOnDisk { path, beside: beside.into(), opened: Mutex::default() }
     }
 
     /// Removes files beside this one, left by processes that were killed while they created them. A process
@@ -93,38 +104,8 @@ impl FileOnDisk {
         Ok(begin)
     }
 
-    fn put_in_place(&self, replace: bool) -> io::Result<()> {
-        if replace {
-            fs::set_permissions(&self.beside, fs::metadata(&self.path)?.permissions())?;
-            fs::rename(&self.beside, &self.path)?;
-        } else {
-            // Unlike a rename, a link never replaces the file of another process.
-            match fs::hard_link(&self.beside, &self.path) {
-                // If the removal fails, the next process does it.
-                Ok(()) => drop(fs::remove_file(&self.beside)),
-                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => return Err(error),
-                // Not every file system has links.
-                Err(_) => fs::rename(&self.beside, &self.path)?,
-            }
-        }
-        self.sync_folder()
-    }
-
-    #[cfg(unix)]
-    fn sync_folder(&self) -> io::Result<()> {
-        let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
-        fs::File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
-    }
-
-    /// Windows has no way to sync a folder.
-    #[cfg(not(unix))]
-    fn sync_folder(&self) -> io::Result<()> {
-        Ok(())
-    }
-}
-
-impl Disk for FileOnDisk {
-    fn size(&self) -> Result<Option<u64>, FileError> {
+    /// What is at the path; `None` if there is nothing.
+    fn found(&self) -> Result<Option<fs::Metadata>, FileError> {
         let found = match fs::metadata(&self.path) {
             Ok(found) => found,
             Err(error) if error.kind() == io::ErrorKind::NotFound => {
@@ -144,11 +125,32 @@ impl Disk for FileOnDisk {
             let what = if found.is_dir() { "a directory" } else { "not a regular file" };
             return Err(FileError::Foreign(what.to_owned()));
         }
-        Ok(Some(found.len()))
+        Ok(Some(found))
+    }
+
+    #[cfg(unix)]
+    fn sync_folder(&self) -> io::Result<()> {
+        let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        fs::File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
+    }
+
+    /// Windows has no way to sync a folder.
+    #[cfg(not(unix))]
+    fn sync_folder(&self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Disk for FileOnDisk {
+    fn size(&self) -> Result<Option<u64>, FileError> {
+        Ok(self.found()?.map(|found| found.len()))
     }
 
     fn open(&self, builder: &Builder) -> Result<Database, FileError> {
+        // First, so that a file that takes its place in between is noticed as another one.
+        let opened = fs::File::open(&self.path)?;
         let database = builder.open(&self.path)?;
+        *lock(&self.opened) = Some(opened);
         self.sweep();
         Ok(database)
     }
@@ -172,15 +174,54 @@ impl Disk for FileOnDisk {
         Ok(builder.create(&self.beside)?)
     }
 
-    fn install(&self, replace: bool) -> Result<(), FileError> {
-        self.put_in_place(replace).map_err(|error| match error.kind() {
-            io::ErrorKind::AlreadyExists => FileError::Locked,
-            _ => error.into(),
-        })
+    fn is_in_place(&self) -> Result<bool, FileError> {
+        let Some(found) = self.found()? else { return Ok(false) };
+        match &*lock(&self.opened) {
+            Some(opened) if is_same(&opened.metadata()?, &found) => Ok(true),
+            Some(_) => Err(FileError::Replaced),
+            None => Err(FileError::Locked),
+        }
+    }
+
+    fn install(&self) -> Result<(), FileError> {
+        let created = fs::File::open(&self.beside)?;
+        // NFS may know nothing more of a file that is gone.
+        if let Some(Ok(old)) = lock(&self.opened).as_ref().map(fs::File::metadata) {
+            fs::set_permissions(&self.beside, old.permissions())?;
+        }
+        if self.is_in_place()? {
+            fs::rename(&self.beside, &self.path)?;
+        } else {
+            // Unlike a rename, a link never replaces the file of another process.
+            match fs::hard_link(&self.beside, &self.path) {
+                // If the removal fails, the next process does it.
+                Ok(()) => drop(fs::remove_file(&self.beside)),
+                Err(error) if error.kind() == io::ErrorKind::AlreadyExists => {
+                    return Err(FileError::Locked);
+                }
+                // Not every file system has links.
+                Err(_) => fs::rename(&self.beside, &self.path)?,
+            }
+        }
+        // It is there, also if the folder can't be synced.
+        *lock(&self.opened) = Some(created);
+        Ok(self.sync_folder()?)
     }
 
     fn discard(&self) {
         // Usually it is in place or was never created.
         let _ = fs::remove_file(&self.beside);
     }
+}
+
+#[cfg(unix)]
+fn is_same(one: &fs::Metadata, other: &fs::Metadata) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    (one.dev(), one.ino()) == (other.dev(), other.ino())
+}
+
+/// The standard library does not show the number of a file on Windows.
+#[cfg(not(unix))]
+fn is_same(_: &fs::Metadata, _: &fs::Metadata) -> bool {
+    true
 }

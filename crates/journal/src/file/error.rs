@@ -19,6 +19,12 @@ pub enum FileError {
     Foreign(String),
     #[error("the file is of a newer release: its format version is {found}, allowed: {allowed}")]
     Newer { found: u64, allowed: u64 },
+    /// Something has put another file in the place of the one that is open.
+    #[error(
+        "another file is in its place. Move that one away, and the contents are written to a new file; \
+         a start would load the other file"
+    )]
+    Replaced,
     #[error("{0}")]
     Io(#[from] io::Error),
     /// The file does not fit the log of its memories.

@@ -37,7 +37,8 @@ pub struct Options {
     /// With `sync` 0: how many steps, and how many bytes of steps, may wait. One step always may.
     pub max_steps: usize,
     pub max_bytes: usize,
-    /// How long after an I/O error the next attempt follows if there is no step.
+    /// With `sync` 0 and no step for this time: the file is looked for, and after an I/O error the next attempt
+    /// follows.
     pub retry: Duration,
     /// A disk that does not answer for longer is an error in the status.
     pub patience: Duration,
@@ -270,7 +271,9 @@ impl MemoryFile {
     pub fn status(&self) -> Status {
         let mut status = lock(&self.status).clone();
         let written: u64 = self.members.iter().map(|member| member.memory.writes()).sum();
-        status.pending = if self.options.stores_before_reply() {
+        status.pending = if status.is_away {
+            written
+        } else if self.options.stores_before_reply() {
             self.queue.waiting() as u64
         } else {
             written.saturating_sub(self.stored_writes.load(Ordering::Relaxed))

@@ -46,8 +46,9 @@ impl Periodic {
     fn store_changes(&mut self) -> Result<(), FileError> {
         // Writes after this are in the contents, perhaps, and stored again.
         let written = writes(&self.memories);
-        if written == self.stored_writes.load(Ordering::Relaxed) && !self.store.in_doubt() {
-            return Ok(());
+        if written == self.stored_writes.load(Ordering::Relaxed) {
+            // The file may be gone, or in doubt.
+            return self.store.store(Changes::default());
         }
         let (contents, note) = match &self.log {
             None => (Memory::contents(&self.memories), None),

@@ -21,6 +21,10 @@ pub struct Status {
     pub last_commit: Duration,
     /// The size of the file.
     pub bytes: u64,
+    /// How often the file was gone, and was written anew.
+    pub recreated: u64,
     /// Since when the disk has not answered.
     pub(super) busy_since: Option<Instant>,
+    /// Nothing of the contents is in the file: it is gone, or another one is in its place.
+    pub(super) is_away: bool,
 }

@@ -61,7 +61,7 @@ impl Store {
                     Ok((database, image))
                 })?
             }
-            None => (create(&*disk, &Image::default(), false)?, Image::default()),
+            None => (create(&*disk, &Image::default())?, Image::default()),
         };
         let store = Store { disk, database, image, in_doubt: false, status };
         store.note(|status| status.bytes = store.bytes());
@@ -72,46 +72,48 @@ impl Store {
         &self.image
     }
 
-    pub const fn in_doubt(&self) -> bool {
-        self.in_doubt
-    }
-
-    /// Stores changes durably, in one transaction.
+    /// Stores changes durably, in one transaction. If the file is gone or in doubt, writes all contents to a
+    /// new one, even without changes.
     ///
     /// # Errors
-    /// [`FileError`]. The image is unchanged then, and the next call writes a new file.
+    /// [`FileError`]. The image is unchanged then. After a transaction that failed, the next call writes a new
+    /// file.
     pub fn store(&mut self, changes: Changes) -> Result<(), FileError> {
-        if changes.is_empty() && !self.in_doubt {
-            return Ok(());
-        }
         let began = Instant::now();
         self.note(|status| status.busy_since = Some(began));
         let stored = self.try_store(changes);
+        let is_away = stored.is_err()
+            && matches!(self.disk.is_in_place(), Ok(false) | Err(FileError::Replaced));
         let bytes = self.bytes();
         self.note(|status| {
-            status.busy_since = None;
-            match &stored {
-                Ok(()) => {
-                    status.failing = None;
-                    status.stored_at = Some(SystemTime::now());
-                    status.commits += 1;
-                    status.last_commit = began.elapsed();
-                    status.bytes = bytes;
-                }
-                Err(error) => status.failing = Some(error.to_string()),
+            (status.busy_since, status.is_away) = (None, is_away);
+            status.failing = stored.as_ref().err().map(ToString::to_string);
+            if let Ok(true) = stored {
+                status.stored_at = Some(SystemTime::now());
+                status.commits += 1;
+                status.last_commit = began.elapsed();
+                status.bytes = bytes;
             }
         });
-        stored
+        stored.map(drop)
     }
 
-    fn try_store(&mut self, changes: Changes) -> Result<(), FileError> {
+    /// Returns whether there was anything to store.
+    fn try_store(&mut self, changes: Changes) -> Result<bool, FileError> {
+        let is_gone = !self.disk.is_in_place()?;
+        // What follows may fail when the new file is in place already.
+        self.in_doubt |= is_gone;
         if self.in_doubt {
             let mut image = self.image.clone();
             image.apply(changes);
-            self.database = create(&*self.disk, &image, true)?;
+            self.database = create(&*self.disk, &image)?;
             self.image = image;
             self.in_doubt = false;
-            return Ok(());
+            self.note(|status| status.recreated += u64::from(is_gone));
+            return Ok(true);
+        }
+        if changes.is_empty() {
+            return Ok(false);
         }
         // Also true if it panics.
         self.in_doubt = true;
@@ -120,7 +122,7 @@ impl Store {
         transaction.commit()?;
         self.in_doubt = false;
         self.image.apply(changes);
-        Ok(())
+        Ok(true)
     }
 
     /// Closes the file.
@@ -165,11 +167,11 @@ fn guarded<T>(open: impl FnOnce() -> Result<T, FileError>) -> Result<T, FileErro
 }
 
 /// Writes a new file and puts it in place.
-fn create(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Database, FileError> {
-    create_beside(disk, image, replace).inspect_err(|_| disk.discard())
+fn create(disk: &dyn Disk, image: &Image) -> Result<Database, FileError> {
+    create_beside(disk, image).inspect_err(|_| disk.discard())
 }
 
-fn create_beside(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Database, FileError> {
+fn create_beside(disk: &dyn Disk, image: &Image) -> Result<Database, FileError> {
     let database = disk.create(&builder())?;
     let transaction = database.begin_write()?;
     transaction.open_table(ABOUT)?.insert(FORMAT, WITHOUT_FILES)?;
@@ -177,7 +179,7 @@ fn create_beside(disk: &dyn Disk, image: &Image, replace: bool) -> Result<Databa
     let note = image.note.clone().map(Some);
     write(&transaction, &Changes { memories, note, ..Changes::default() })?;
     transaction.commit()?;
-    disk.install(replace)?;
+    disk.install()?;
     Ok(database)
 }
 

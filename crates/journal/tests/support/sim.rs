@@ -251,9 +251,12 @@ impl Disk for SimDisk {
         Ok(builder.create_with_backend(self.handle(number))?)
     }
 
-    fn install(&self, replace: bool) -> Result<(), FileError> {
+    fn is_in_place(&self) -> Result<bool, FileError> {
+        Ok(self.state.state().file.is_some())
+    }
+
+    fn install(&self) -> Result<(), FileError> {
         let mut state = self.state.changing()?;
-        assert!(replace || state.file.is_none(), "nothing is replaced by chance");
         state.file = state.beside.take();
         Ok(())
     }

@@ -132,7 +132,7 @@ _STATS = json.loads(
      "events_lost": 0, "log_dropped": 0, "tag_polls_dropped": 0,
      "memory_files": {"/var/lib/holdfast/setpoints.redb": {"failing": null,
         "stored_at": 1893456000.0, "commits": 12, "pending": 0, "refused": 0, "busy": 0,
-        "last_commit_seconds": 0.004, "bytes": 73728}},
+        "last_commit_seconds": 0.004, "bytes": 73728, "recreated": 0}},
      "logs": {"site": {"phase": "running", "connected": true, "contact_age": 0.2, "sequence": 5000,
         "lag": 0, "steps": 1200, "unavailable": 0, "not_confirmed": 0, "refused": 0, "ignored": 0,
         "nodes": [{"name": "scada-a", "sequence": 5000, "time_ns": 1893456000000000000,

@@ -124,6 +124,7 @@ _MEMORY_FILE = object_of(
         "busy": count("Writes refused because too many waited for the disk"),
         "last_commit_seconds": NUMBER,
         "bytes": count("Size of the file"),
+        "recreated": count("How often the file was gone, and was written anew"),
     }
 )
 _LOG = object_of(

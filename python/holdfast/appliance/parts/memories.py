@@ -34,6 +34,7 @@ class Memories(Part):
         self._files: dict[Path, _core.MemoryFile] = {}
         self._of_logs: dict[str, Path] = {}
         self._failing: dict[Path, str | None] = {}
+        self._recreated: dict[Path, int] = {}
         self._only_copies: set[Path] = set()
         """Files that are written: what they lack is lost, unlike in those of logs."""
         self.lost_writes = 0
@@ -105,6 +106,7 @@ class Memories(Part):
             if lost and path in self._only_copies:
                 self.lost_writes += lost
                 log_lines.write(logging.ERROR, "memory_file_lost", file=path, writes=lost)
+        self._log_recreated(path, file)
 
     def of_log(self, log: str) -> Path | None:
         """The file of the memories of a log."""
@@ -130,14 +132,23 @@ class Memories(Part):
         return {"memory_files": {str(path): dict(file.status()) for path, file in files}}
 
     def tick(self) -> None:
-        """Logs when a file can't be written any more, and when it can again."""
+        """Logs when a file can't be written any more, for each reason, and when it can again."""
         for path, file in self._files.items():
-            error = file.status()["failing"]
-            if error is not None and self._failing.get(path) is None:
-                log_lines.write(logging.ERROR, "memory_file_failing", file=path, error=error)
-            elif error is None and self._failing.get(path) is not None:
-                log_lines.write(logging.INFO, "memory_file_back", file=path)
+            self._log_recreated(path, file)
+            before, error = self._failing.get(path), file.status()["failing"]
             self._failing[path] = error
+            if error == before:
+                continue
+            if error is not None:
+                log_lines.write(logging.ERROR, "memory_file_failing", file=path, error=error)
+            else:
+                log_lines.write(logging.INFO, "memory_file_back", file=path)
+
+    def _log_recreated(self, path: Path, file: _core.MemoryFile) -> None:
+        count = file.status()["recreated"]
+        if count > self._recreated.get(path, 0):
+            log_lines.write(logging.WARNING, "memory_file_recreated", file=path)
+        self._recreated[path] = count
 
 
 def created(config: Config, name: str) -> Memory:
