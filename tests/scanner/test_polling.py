@@ -8,6 +8,7 @@ import threading
 import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
+from unittest.mock import Mock
 
 import pytest
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
     from holdfast import _core
     from holdfast.scanner.polling.poller import Poll
+    from holdfast.scanner.subscriptions.device import ScannedDevice
 
 LONG_AGO = 100.0
 """Seconds."""
@@ -144,3 +146,32 @@ def test_polls_that_wait_are_not_handled_after_the_end(monkeypatch: pytest.Monke
         return came
 
     assert len(asyncio.run(run())) < 100
+
+
+def test_only_the_polls_of_a_former_address_are_discarded() -> None:
+    class Noting(Polling):
+        def _native(self, _device: ScannedDevice, name: str) -> Any:
+            return name
+
+    async def run() -> list[tuple[str, bool]]:
+        changes: list[tuple[str, bool]] = []
+        core = SimpleNamespace(
+            receiver=lambda: Results([]),
+            remove=lambda _: None,
+            add=lambda name: changes.append((name, False)),
+            replace=lambda old, name, **_: changes.append((name, old == name)),
+        )
+        polling = Noting(cast("_core.Poller", core))
+        polling.start(lambda *_: None)
+        device = cast("ScannedDevice", Mock(polled_as="", endpoint=object()))
+        polling._renew(device)
+        polling._renew(device)
+        device.endpoint = cast("Any", object())
+        polling._renew(device)
+        assert polling._devices == {device.polled_as: device}
+        await polling.stop()
+        return changes
+
+    changes = asyncio.run(run())
+    assert [keeps_name for _, keeps_name in changes] == [False, True, False]
+    assert len({name for name, _ in changes}) == 2

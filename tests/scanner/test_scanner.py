@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
+import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -13,8 +14,10 @@ from nats.aio.msg import Msg
 import holdfast
 from holdfast.scanner import requests as scanner_requests
 from holdfast.scanner import responder
+from holdfast.scanner.polling import poller
 from holdfast.scanner.subscriptions.subscription import subscription_of
 from support import wire
+from support.fake_device import FakeDevice, registers
 from support.nats_bus import leaving, subscription, tag
 from support.scanner_parts import broker_of, client_of, polling_of
 
@@ -428,15 +431,15 @@ def test_who_leaves_a_slow_device_causes_no_scan(
     run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     polling = polling_of(run_scanner().scanner)
-    poller, replaced = polling._poller, []
+    native, replaced = polling._poller, []
 
     class Spy:
         def __getattr__(self, name: str) -> Any:
-            return getattr(poller, name)
+            return getattr(native, name)
 
         def replace(self, name: str, device: Any, *, at_once: bool) -> None:
             replaced.append(at_once)
-            poller.replace(name, device, at_once=at_once)
+            native.replace(name, device, at_once=at_once)
 
     monkeypatch.setattr(polling, "_poller", Spy())
     data = caller.listen("modbus.data.plc1")
@@ -451,6 +454,31 @@ def test_who_leaves_a_slow_device_causes_no_scan(
     assert caller.request("modbus.unsubscribe", leaving("a"))["success"]
     wire.until(lambda: len(replaced) == 2, "it is polled for what is left")
     assert replaced == [True, False]
+
+
+def test_a_scan_during_which_tags_change_is_published(
+    caller: Caller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(poller, "MIN_CHANGE_INTERVAL_S", 0.0)
+    asked, may_answer = threading.Semaphore(0), threading.Semaphore(0)
+
+    def answer(pdu: bytes) -> bytes:
+        asked.release()
+        assert may_answer.acquire(timeout=wire.DEADLINE)
+        return registers(pdu, 7)
+
+    with FakeDevice(answer) as plc:
+        data = caller.listen("modbus.data.plc1")
+        request = {"deviceId": "plc1", "url": plc.url, "scanRate": 100, "timeout": 30_000}
+        first = request | {"subscriberId": "hmi", "tags": [tag("a", 0)]}
+        assert caller.request("modbus.subscribe", first)["success"]
+        assert asked.acquire(timeout=wire.DEADLINE)
+        second = request | {"subscriberId": "historian", "tags": [tag("b", 500)]}
+        assert caller.request("modbus.subscribe", second)["success"]
+        may_answer.release()  # Only this read: the next scan waits.
+        assert data.next()["variableId"] == "a"
+        may_answer.release(1000)
+        data.until(lambda message: message["variableId"] == "b", "it is in the next scan")
 
 
 def test_numbers_without_a_fraction_are_integers_as_in_javascript(

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import math
 import threading
 import time
 from collections import deque
@@ -74,7 +75,8 @@ class Polling:
         self._exact_pauses_s = exact_pauses_s
         self._devices: dict[str, ScannedDevice] = {}
         """The devices by their name in the poller."""
-        self._changed_at: dict[ScannedDevice, float] = {}
+        self._changed: dict[ScannedDevice, tuple[float, _core.Endpoint | None]] = {}
+        """When each device was changed last, and its address since then."""
         self._pending_changes: dict[ScannedDevice, asyncio.TimerHandle] = {}
         self._paused: set[ScannedDevice] | None = None
         """The devices to poll when polling is resumed; `None` while it is not paused."""
@@ -114,8 +116,9 @@ class Polling:
             self._urgent.add(device)
         if device in self._pending_changes:
             return
-        left = self._changed_at.get(device, 0.0) + MIN_CHANGE_INTERVAL_S - self._loop.time()
-        if device in self._changed_at and left > 0:
+        changed_at, _ = self._changed.get(device, (-math.inf, None))
+        left = changed_at + MIN_CHANGE_INTERVAL_S - self._loop.time()
+        if left > 0:
             self._pending_changes[device] = self._loop.call_later(left, self._renew, device)
         else:
             self._renew(device)
@@ -123,12 +126,15 @@ class Polling:
     def _renew(self, device: ScannedDevice) -> None:
         """Replaces a device in the poller.
 
-        Each change gives the device a new name, so that results of the old tags are discarded.
+        The current poll completes, and counts: its blocks have addresses, so they are right for any
+        tags. If it did not, a device that is changed often would have no values and no health. A
+        device that has moved gets a new name, so that results from its old address are discarded.
         """
         self._pending_changes.pop(device, None)
         at_once = device in self._urgent
         self._urgent.discard(device)
-        old, name = device.polled_as, f"{PREFIX}{next(NUMBERS)}"
+        old, (_, address) = device.polled_as, self._changed.get(device, (None, None))
+        name = old if old and address is device.endpoint else f"{PREFIX}{next(NUMBERS)}"
         if old:
             self._poller.replace(old, self._native(device, name), at_once=at_once)
             del self._devices[old]
@@ -136,7 +142,7 @@ class Polling:
             self._poller.add(self._native(device, name))
         device.polled_as = name
         self._devices[name] = device
-        self._changed_at[device] = self._loop.time()
+        self._changed[device] = (self._loop.time(), device.endpoint)
 
     def drop(self, device: ScannedDevice) -> None:
         """Stops polling a device and closes its connection, if it is polled."""
@@ -150,7 +156,7 @@ class Polling:
         self._urgent.discard(device)
         self._poller.remove(device.polled_as)
         del self._devices[device.polled_as]
-        del self._changed_at[device]
+        del self._changed[device]
 
     def pause(self) -> None:
         """Stops polling all devices and closes their connections, until `resume`."""
@@ -286,7 +292,7 @@ class Polling:
             while polls:
                 name, due, blocks = polls.popleft()
                 device = self._devices.get(name)
-                if device is not None:  # Else it was changed meanwhile, and has another name.
+                if device is not None:  # Else it was removed meanwhile, or has moved.
                     self._on_poll(device, due, blocks)
                 if self._loop.time() >= until:
                     break

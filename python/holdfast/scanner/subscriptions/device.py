@@ -89,7 +89,7 @@ class ScannedDevice:
     partition: int = 0
     """The partition of a fleet that it belongs to."""
     polled_as: str = ""
-    """The device's name in the poller. Each change gives it a new one."""
+    """The device's name in the poller. It gets a new one when it moves to another address."""
     _looked_up: float = field(default_factory=time.monotonic)
 
     @property
