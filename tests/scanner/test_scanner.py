@@ -19,10 +19,10 @@ from holdfast.scanner.subscriptions.subscription import subscription_of
 from support import wire
 from support.fake_device import FakeDevice, registers
 from support.nats_bus import leaving, subscription, tag
-from support.scanner_parts import broker_of, client_of, polling_of
+from support.scanner_parts import broker_of, client_of, polling_of, registry_of
 
 if TYPE_CHECKING:
-    from support.nats_bus import Caller, Inbox, Run
+    from support.nats_bus import Caller, Inbox, Run, Running
     from support.running import Serve
 
 pytestmark = pytest.mark.usefixtures("scanner")
@@ -479,6 +479,36 @@ def test_a_scan_during_which_tags_change_is_published(
         assert data.next()["variableId"] == "a"
         may_answer.release(1000)
         data.until(lambda message: message["variableId"] == "b", "it is in the next scan")
+
+
+def test_a_tag_that_comes_back_has_no_value_from_before(scanner: Running, caller: Caller) -> None:
+    goes_on = threading.Event()
+    goes_on.set()
+
+    def answer(pdu: bytes) -> bytes:
+        assert goes_on.wait(wire.DEADLINE)
+        return registers(pdu, 7)
+
+    def latest() -> dict[str, tuple[Any, str]]:
+        found = caller.request("modbus.variables", b"")
+        return {each["variableId"]: (each["value"], each["quality"]) for each in found}
+
+    with FakeDevice(answer) as plc:
+        request = {"deviceId": "plc1", "url": plc.url, "scanRate": 100, "timeout": 30_000}
+        stays = request | {"subscriberId": "historian", "tags": [tag("a", 0)]}
+        goes = request | {"subscriberId": "hmi", "tags": [tag("b", 500)]}
+        for each in (stays, goes):
+            assert caller.request("modbus.subscribe", each)["success"]
+        both = {"a": (7, "good"), "b": (7, "good")}
+        wire.until(lambda: latest() == both, "both are read")
+        assert caller.request("modbus.unsubscribe", leaving("b"))["success"]
+        known = registry_of(scanner.scanner).devices["plc1"]
+        wire.until(lambda: len(known.health.blocks) == 1, "it is not scanned any more")
+        goes_on.clear()
+        assert caller.request("modbus.subscribe", goes)["success"]
+        assert latest() == {"a": (7, "good"), "b": (None, "uncertain")}
+        goes_on.set()
+        wire.until(lambda: latest() == both, "both are read again")
 
 
 def test_numbers_without_a_fraction_are_integers_as_in_javascript(

@@ -170,6 +170,7 @@ class Devices:
         if device.may_have_moved():
             self._begin_task(self._look_up(device))
         device.latest.take(blocks)
+        device.latest.forget_except(health.blocks)
         self._publishers.publish_values(device, due, blocks)
 
     async def _look_up(self, device: ScannedDevice) -> None:

@@ -89,7 +89,7 @@ def variable(device: ScannedDevice, tag: Tag, module: str) -> Variable:
     quality: Quality = "good"
     if latest is None:
         quality = "uncertain"
-    elif device.health.state != "online" or tag.id in device.undecoded or _failed(device, tag):
+    elif device.health.state != "online" or tag.id in device.undecoded or not _read(device, tag):
         quality = "bad"
     return Variable(
         module_id=module,
@@ -104,10 +104,12 @@ def variable(device: ScannedDevice, tag: Tag, module: str) -> Variable:
     )
 
 
-def _failed(device: ScannedDevice, tag: Tag) -> bool:
-    """Returns whether the last scan that read a tag failed."""
+def _read(device: ScannedDevice, tag: Tag) -> bool:
+    """Returns whether the last scan read a tag, without a fault."""
     span = tag.span
-    return any(
-        fault and area == tag.area and address <= span.start and span.stop <= address + count
+    faults = [
+        fault
         for area, address, count, _, fault, _ in device.health.blocks
-    )
+        if area == tag.area and address <= span.start and span.stop <= address + count
+    ]
+    return bool(faults) and not any(faults)

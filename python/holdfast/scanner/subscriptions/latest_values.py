@@ -7,10 +7,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from holdfast.scanner.subscriptions.health import without_overlap
 from holdfast.tags.decoding import Undecoded, value_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from holdfast.scanner.subscriptions.tag import Tag
     from holdfast.types import Area, PolledBlock
@@ -41,6 +42,13 @@ class LatestBlocks:
             if place not in self._blocks:  # The plan has changed, so former blocks may overlap.
                 self._forget_inside(area, address, address + count)
             self._blocks[place] = (data, time)
+
+    def forget_except(self, blocks: Sequence[PolledBlock]) -> None:
+        """Forgets the blocks that overlap none of these: no tag needs them any more."""
+        if self._blocks.keys() <= {block[:3] for block in blocks}:  # Nearly always.
+            return
+        for place in without_overlap(self._blocks, blocks):
+            del self._blocks[place]
 
     def value(self, tag: Tag) -> Latest | None:
         """Returns the latest value of a tag; `None` if it was never read.
