@@ -55,6 +55,10 @@ def test_an_error_of_windows_has_the_text_of_its_own_number(
     assert os_error_text(refused) == texts[1225]
 
 
+def test_nothing_is_suggested_for_a_long_word() -> None:
+    assert suggestion("m" * 256 + "emory", ["m" * 256 + "emory"]) == ""
+
+
 def test_a_word_in_another_case_is_suggested_before_words_that_are_close() -> None:
     types = ["modbus-udp", "modbus-tcp", "read_only"]
     assert suggestion("Modbus-TCP", types) == "; did you mean 'modbus-tcp'?"

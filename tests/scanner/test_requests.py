@@ -104,6 +104,11 @@ WRONG: list[tuple[dict[str, Any], str]] = [
         "tags[0]: int32 from address 65535: the last address is",
     ),
     ({"tags": [tag("a", 0, "int8")]}, "tags[0]: type 'int8' is unknown, allowed:"),
+    *(
+        ({"tags": [tag("a", 0) | {key: "x" * (most + 1)}]}, f"of length <= {most} - at `$.tags[0]")
+        for key, most in (("datatype", 64), ("byteOrder", 64), ("description", 4096))
+    ),
+    ({"byteOrder": "x" * 65}, "of length <= 64 - at `$.byteOrder`"),
     ({"tags": [tag("a", 0, "string:252")]}, "tag 'a': string:252 has 126 registers, one request"),
     ({"tags": [tag("a", 0, functionCode="coils")]}, "allowed: coil, discrete, holding, input"),
     ({"tags": [tag("a", 0, byteOrder="CDABGHEF")]}, "order CDABGHEF is for 8 bytes"),

@@ -335,6 +335,12 @@ def test_a_type_of_another_program_is_suggested_as_it_is_called_here(name: str, 
         register_count(name)
 
 
+def test_no_type_is_suggested_for_a_long_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("holdfast.values.types._meant", lambda _: pytest.fail("it is compared"))
+    with pytest.raises(values.UnknownType, match=r"^type 'float3.*'… is .* arrays: float32\[10\]$"):
+        register_count("float3" * 100_000)
+
+
 @pytest.mark.parametrize("name", ["qqqqqq", "sint", "USINT", "uint8", "uint24", "byte", "bit16"])
 def test_no_type_is_suggested_for_what_is_like_none(name: str) -> None:
     with pytest.raises(values.UnknownType, match=r"arrays: float32\[10\]$"):

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
 MAX_CHARACTERS = 40
 """A longer value is cut."""
 
+MAX_COMPARED = 256
+"""Nothing is suggested for longer words: to compare one of a megabyte takes seconds."""
+
 TIME = re.compile(r"([0-9]+\.?[0-9]*|\.[0-9]+)(?:e([+-]?[0-9]{1,3}))? ?([a-z]*)", re.I)
 """A time as people write it: a number, its exponent, and its unit."""
 
@@ -105,6 +108,8 @@ def suggestion(word: object, known: Iterable[object]) -> str:
     import difflib
 
     words, text = list(map(str, known)), str(word)
+    if len(text) > MAX_COMPARED:
+        return ""
     same = [each for each in words if _plain(each) == _plain(text)]
     close = same or difflib.get_close_matches(text, words, 1)
     close = close or difflib.get_close_matches(text.lower(), words, 1)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from holdfast.protocol import ADDRESSES
+from holdfast.runtime.text import MAX_COMPARED
 from holdfast.values.errors import UnknownType, shown
 
 FIXED = {
@@ -138,6 +139,8 @@ _SIZED = re.compile(r"(bit|bytes|char|str|string|text)([:.\[]?)([0-9]{1,6})[.\]]
 
 
 def _unknown(name: object) -> UnknownType:
+    if len(str(name)) > MAX_COMPARED:
+        return UnknownType(f"type {shown(name)} is unknown, allowed: {ALLOWED}")
     base, bracket, count = re.sub(r"[\s_-]", "", str(name).lower()).partition("[")
     meant = _meant(base)
     sized = _SIZED.fullmatch(base + bracket + count)
@@ -164,7 +167,8 @@ def _meant(word: str) -> str:
     known = (*FIXED, *USUAL_NAMES)
     if word not in known:
         # Sign and size must not be guessed: others copy what is suggested.
-        alike = [each for each in known if _traits(each) == _traits(word)]
+        traits = _traits(word)
+        alike = [each for each in known if _traits(each) == traits]
         swapped = [each for each in known if sorted(each) == sorted(word)]
         # Imported here, for a fast start: only wrong names need it.
         import difflib

@@ -25,7 +25,12 @@ Id = Annotated[str, Meta(min_length=1, max_length=256)]
 Address = Annotated[int, Meta(ge=0, le=LAST_ADDRESS)]
 Range = Annotated[list[FunctionCode | Address], Meta(min_length=2, max_length=3)]
 Ranges = Annotated[list[Range], Meta(max_length=32)]
+Word = Annotated[str, Meta(max_length=64)]
+"""The name of a type, an order or an encoding."""
 Marker = bool | int | float | str
+
+MAX_DESCRIPTION = 4096
+"""The most characters of a description."""
 
 MAX_TTL_S = 31_536_000
 """The longest `ttl` in seconds: a year."""
@@ -46,15 +51,15 @@ class TagRequest(Request):
     address: Address
     """Counted from 0."""
     function_code: FunctionCode
-    datatype: str
+    datatype: Word
     """`boolean`, `int16`, `float32`, `string:10` and every other type of `holdfast.values`."""
-    byte_order: str | None = None
+    byte_order: Word | None = None
     """Default: the byte order of the device."""
-    encoding: Annotated[str, Meta(max_length=64)] | None = None
+    encoding: Word | None = None
     """The encoding of `string:N`. Default: ASCII."""
     writable: bool | None = None
     """Default: writable, in areas that can be written."""
-    description: str | None = None
+    description: Annotated[str, Meta(max_length=MAX_DESCRIPTION)] | None = None
     null: Annotated[list[Marker], Meta(max_length=32)] | None = None
     """Values that mean "not available"; they are published as `null`."""
     profile: Id | None = None
@@ -92,7 +97,7 @@ class SubscribeRequest(Request):
     """Replaces host, port and transport."""
     unit_id: Annotated[int, Meta(ge=0, le=MAX_UNIT)] | None = None
     """Default: 1."""
-    byte_order: str | None = None
+    byte_order: Word | None = None
     """Default: `ABCD`. `big` is `ABCD`, `little` is `DCBA`."""
     scan_rate: int | None = None
     """The scan interval in milliseconds. Default: 1000."""
