@@ -7,15 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from holdfast.scanner.jetstream import entries
+from holdfast.scanner.messages.types import SubscribeRequest, TagRequest
 from holdfast.tags import Tag, TagList
 from holdfast.tags.scale import RegisterScale
 from holdfast.values import encode
 from support import wire
-from support.nats_bus import leaving, subscription, tag
+from support.nats_bus import leaving, logged, subscription, tag
 
 if TYPE_CHECKING:
     import holdfast
-    from support.nats_bus import Caller, Run
+    from support.nats_bus import Caller, Run, Running
 
 PROFILE = TagList(
     [
@@ -151,6 +153,85 @@ def test_a_subscription_to_a_profile_survives_a_restart(
     assert first(data, 4) == {"water": 21.5, "setpoint": 17.5, "mode": 1, "open": False}
     answer = caller.request("line2.command.plc1.setpoint", "4")
     assert "4 is outside 5 to 30" in answer["error"]
+
+
+@pytest.mark.parametrize("part_bytes", [1, entries.MAX_PART_BYTES])
+def test_a_kept_subscription_has_the_tags_that_its_profile_has_now(
+    caller: Caller,
+    server: holdfast.Server,
+    run_scanner: Run,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    part_bytes: int,
+) -> None:
+    monkeypatch.setattr(entries, "MAX_PART_BYTES", part_bytes)
+    other = TagList(
+        [
+            Tag("water", "holding_registers", 5, "int16", description="now described"),
+            Tag("setpoint", "holding_registers", 1, scale=0.1, writable=True, min=5, max=30),
+            Tag("operation", "holding_registers", 2, states={0: "off", 1: "eco"}, writable=True),
+            Tag("open", "coils", 3),
+        ]
+    )
+
+    def running(profile: TagList) -> Running:
+        return run_scanner(prefix="line2", profiles={"heater": profile}, writes="explicit")
+
+    def tags() -> dict[str, dict[str, Any]]:
+        found = caller.request("line2.browse", b"")["devices"]
+        return {each["deviceId"]: {tag["id"]: tag for tag in each["tags"]} for each in found}
+
+    first = running(PROFILE)
+    mode, own = tag("mode", 0, profile="heater"), tag("own", 9)
+    replaced = tag("open", 3, "boolean", functionCode="coil")
+    for request in (
+        subscription(server, own, replaced, profile="heater"),
+        subscription(server, own, mode, deviceId="plc2"),
+        subscription(server, mode, deviceId="plc3"),
+    ):
+        assert caller.request("line2.subscribe", request)["success"]
+    before = tags()
+    first.stop()
+    second = running(PROFILE)
+    assert tags() == before
+    second.stop()
+    status = caller.listen("line2.status.plc3")
+    third = running(other)
+    assert status.next() | {"timestamp": 0} == {
+        "deviceId": "plc3",
+        "state": "offline",
+        "failures": 0,
+        "error": "tags[0]: the profile heater has no tag 'mode'",
+        "timestamp": 0,
+    }
+    now = tags()
+    assert {id: set(found) for id, found in now.items()} == {
+        "plc1": {"own", "open", "water", "setpoint", "operation"},
+        "plc2": {"own"},
+    }
+    for id in ("own", "open", "setpoint"):
+        assert now["plc1"][id] == before["plc1"][id]
+    water = now["plc1"]["water"]
+    assert (water["address"], water["description"]) == (5, "now described")
+    assert now["plc1"]["operation"]["writable"]
+    lost = {(each["device"], each["tags"]) for each in logged(caplog, "tags_not_restored")}
+    assert lost == {("plc1", "mode"), ("plc2", "mode")}
+
+    # A subscription that has left a tag of its profile stays as it is.
+    assert caller.request("line2.unsubscribe", leaving("water"))["success"]
+    third.stop()
+    running(PROFILE)
+    assert set(tags()["plc1"]) == {"own", "open", "setpoint"}
+
+
+def test_a_pending_subscription_that_leaves_a_tag_of_its_profile_has_not_all_of_it() -> None:
+    tags = [TagRequest("a", 0, "holding", "int16", profile="p"), TagRequest("b", 1, "coil", "bool")]
+    request = SubscribeRequest("plc1", "hmi", tags, profile="p")
+    [own_left] = entries.without([request], {"b"})
+    assert (own_left.profile, own_left.tags) == ("p", tags[:1])
+    [profile_left] = entries.without([request], {"a"})
+    assert (profile_left.profile, profile_left.tags) == (None, tags[1:])
+    assert entries.without([request], {"a", "b"}) == []
 
 
 def test_a_scale_in_a_register_is_that_of_the_same_scan(

@@ -50,6 +50,9 @@ class DeviceHost(Protocol):
     def end(self, device: ScannedDevice) -> None:
         """Polls a device no more."""
 
+    def give_up(self, device_id: str, reason: str) -> None:
+        """Publishes that a device is offline whose stored subscription is refused."""
+
 
 class SubscriptionHost(Protocol):
     """Carries out what is stored."""

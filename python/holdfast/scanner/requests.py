@@ -8,6 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
+from holdfast.runtime.text import clip
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.entries import requests as stored_requests
 from holdfast.scanner.jetstream.entries import restored, without
@@ -15,7 +16,7 @@ from holdfast.scanner.jetstream.entry_subscriptions import check_entry
 from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
 from holdfast.scanner.messages.types import Answer, SubscribeRequest, UnsubscribeRequest
 from holdfast.scanner.subscriptions.key import SubscriptionKey
-from holdfast.scanner.subscriptions.subscription import subscription_of
+from holdfast.scanner.subscriptions.subscription import subscription_of, without_lost
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -33,6 +34,9 @@ if TYPE_CHECKING:
 
 RETRY_EXPIRY_S = 1
 """Delay before an expired subscription is removed again after JetStream has failed."""
+
+MAX_LOGGED_IDS = 200
+"""The most characters of tag ids in one line of the log."""
 
 MAX_REMEMBERED = 10_000
 """Limit of remembered subscribers whose requests were adjusted."""
@@ -224,10 +228,34 @@ class Requests:
         if self.is_entry(request.device_id, request.subscriber_id):
             return
         adjustments = Adjustments()
-        subscription = subscription_of(request, self._rules, adjustments)
+        subscription = self._stored_subscription(request, adjustments)
         async with self._devices.lock(subscription.device):
             await self._devices.add(subscription, is_stored=True)
         self._log.byte_orders(subscription, adjustments, subscription.tags)
+
+    def _stored_subscription(
+        self, request: SubscribeRequest, adjustments: Adjustments | None = None
+    ) -> Subscription:
+        """Returns the subscription of a stored request, with the tags that profiles have now.
+
+        Raises `Refused`.
+        """
+        left, lost = without_lost(request, self._rules)
+        device = self._registry.devices.get(request.device_id)
+        is_known = device is not None and request.subscriber_id in device.subscribers
+        if not (left.tags or left.profile or is_known):
+            left, lost = request, []  # Refused, and so kept: the tags may return.
+        subscription = subscription_of(left, self._rules, adjustments)
+        if lost:
+            log_lines.write(
+                logging.WARNING,
+                "tags_not_restored",
+                device=request.device_id,
+                subscriber=request.subscriber_id,
+                tags=clip(", ".join(lost), MAX_LOGGED_IDS),
+                reason="their profile does not have them any more",
+            )
+        return subscription
 
     async def adopt(
         self, device: str, desired: Mapping[str, Sequence[SubscribeRequest]], renewed: set[str]
@@ -269,7 +297,7 @@ class Requests:
                 continue
             tags: set[str] = set()
             for request in requests:
-                subscription = subscription_of(request, self._rules)
+                subscription = self._stored_subscription(request)
                 # A large subscription is stored as several requests.
                 await self._devices.add(subscription, renewed=subscriber in renewed)
                 tags |= subscription.tags.keys()

@@ -182,6 +182,7 @@ class Scanner:
             await self._requests.restore(request)
         except Refused as refused:
             log_lines.write(logging.WARNING, "not_restored", **about, reason=str(refused))
+            self._devices.give_up(request.device_id, str(refused))
             if request.ttl is None:  # Else its subscriber repeats it.
                 owner = SubscriptionKey(request.device_id, request.subscriber_id)
                 self._requests.former.setdefault(owner, []).append(request)

@@ -12,14 +12,15 @@ import msgspec
 from holdfast.client.url import NetworkTarget
 from holdfast.scanner.messages.decoding import decode
 from holdfast.scanner.messages.subject_parts import subject_id
-from holdfast.scanner.messages.types import SubscribeRequest, TagRequest
+from holdfast.scanner.messages.types import MAX_DESCRIPTION, SubscribeRequest, TagRequest
+from holdfast.scanner.subscriptions.device import NO_OPTIONS, TagOptions
 from holdfast.scanner.subscriptions.tag import CODE_OF_AREA
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
 
     from holdfast.scanner.messages.types import Marker
-    from holdfast.scanner.subscriptions.device import ScannedDevice, TagOptions
+    from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.tag import Tag
 
 MAX_PART_BYTES = 128 * 1024
@@ -59,7 +60,10 @@ def _token(text: str) -> str:
 
 
 def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
-    """Yields the requests that make the subscription of a subscriber, each of limited size."""
+    """Yields the requests that make the subscription of a subscriber, each of limited size.
+
+    The first one has the profile, if there is one: it adds the tags that the profile has gained.
+    """
     known = device.subscribers[subscriber]
     head = {
         "deviceId": device.id,
@@ -74,14 +78,17 @@ def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
         "plan": device.source.plan.request,
         "ttl": known.ttl,
     }
-    before = _encode({key: value for key, value in head.items() if value is not None})[:-1]
+    rest = _encode({key: value for key, value in head.items() if value is not None})[:-1]
+    before = rest
+    if known.profile is not None:
+        before += b',"profile":' + _encode(known.profile)
     part: list[bytes] = []
     size = 0
     for id, options in known.tags.items():
-        text = _tag(device.tags[id], options)
+        text = _tag(device.tags[id], options, known.profile)
         if part and size + len(text) > MAX_PART_BYTES:
             yield before + b',"tags":[' + b",".join(part) + b"]}"
-            part, size = [], 0
+            before, part, size = rest, [], 0
         part.append(text)
         size += len(text)
     if part:
@@ -95,11 +102,14 @@ def restored(value: bytes) -> SubscribeRequest:
 
 def without(found: Iterable[SubscribeRequest], ids: Collection[str]) -> list[SubscribeRequest]:
     """Returns the requests without the tags with these ids, if they have tags left."""
-    left = (
-        msgspec.structs.replace(each, tags=[tag for tag in each.tags if tag.id not in ids])
-        for each in found
-    )
-    return [each for each in left if each.tags]
+    requests = []
+    for each in found:
+        left = [tag for tag in each.tags if tag.id not in ids]
+        is_whole = all(tag.profile != each.profile or tag.id not in ids for tag in each.tags)
+        profile = each.profile if is_whole else None
+        if left:
+            requests.append(msgspec.structs.replace(each, tags=left, profile=profile))
+    return requests
 
 
 def _place(device: ScannedDevice) -> dict[str, object]:
@@ -110,8 +120,11 @@ def _place(device: ScannedDevice) -> dict[str, object]:
     return {"host": target.host, "port": target.port, "transport": target.transport}
 
 
-def _tag(tag: Tag, options: TagOptions) -> bytes:
-    """Returns a tag as JSON; without a description that would make it too long."""
+def _tag(tag: Tag, options: TagOptions, profile: str | None) -> bytes:
+    """Returns a tag as JSON; without what a subscription to its whole `profile` sets."""
+    if tag.meaning is not None and tag.profile == profile:
+        options = NO_OPTIONS if options == TagOptions.of_profile(tag.meaning) else options
+    text = options.description
     made = TagRequest(
         id=tag.id,
         address=tag.address,
@@ -120,15 +133,13 @@ def _tag(tag: Tag, options: TagOptions) -> bytes:
         byte_order=tag.order,
         encoding=tag.encoding,
         writable=options.writable,
-        description=options.description,
+        # A tag of a profile may have a longer one than requests.
+        description=None if text is None or len(text) > MAX_DESCRIPTION else text,
         # Sorted: each process has its own order of a set, and nodes of a fleet compare requests.
         null=sorted(map(_marker, tag.null), key=str) or None,
         profile=tag.profile,
     )
-    text = _encode(made)
-    if len(text) > MAX_PART_BYTES:
-        text = _encode(msgspec.structs.replace(made, description=None))
-    return text
+    return _encode(made)
 
 
 def _marker(marker: Marker) -> Marker:

@@ -60,14 +60,14 @@ class StoredSubscriptions(Placement):
         self._store.connected(client)
 
     async def run(
-        self, _devices: DeviceHost, host: SubscriptionHost, ready: asyncio.Event, /
+        self, devices: DeviceHost, host: SubscriptionHost, ready: asyncio.Event, /
     ) -> None:
         """Restores and stores, until it is cancelled.
 
         `host` carries out stored requests. Subscriptions from entries of another bucket are not
         stored. Sets `ready` after the first attempt to restore, or when it takes too long.
         """
-        self._host = host
+        self._device_host, self._host = devices, host
         async with asyncio.TaskGroup() as running:
             running.create_task(self._store.run())
             running.create_task(self._restore(host, ready))
@@ -194,6 +194,7 @@ class StoredSubscriptions(Placement):
                 if owner not in self._logged:
                     self._logged.add(owner)
                     self._log(logging.WARNING, "not_restored", owner, reason=str(refused))
+                    self._device_host.give_up(owner.device, str(refused))
                 continue
             if found and self._pending.get(owner) is found:
                 self._touch(owner)

@@ -93,6 +93,11 @@ class Devices:
             self._polling.renew(device)
         return change.new
 
+    def give_up(self, device_id: str, reason: str) -> None:
+        """Publishes that a device is offline whose stored subscription is refused."""
+        if device_id not in self._registry.devices:  # Else another subscriber has it.
+            self._publishers.publish_given_up(device_id, reason)
+
     def keep_only(self, device_id: str, subscriber_id: str, tags: Collection[str]) -> None:
         """Removes the other tags of a subscription."""
         device = self._registry.devices.get(device_id)

@@ -94,6 +94,14 @@ class Publishers:
                 text = batch.leased(text, lease)
             self._outbox.put([(subject, text)], of=device.id)
 
+    def publish_given_up(self, device_id: str, reason: str) -> None:
+        """Publishes that a device is offline that is not known any more."""
+        status = Status(device_id, "offline", 0, int(time.time() * 1000), reason)
+        for name in self._dialect.device_names(device_id):
+            subject = f"{self._prefix}.status.{name}"
+            text = batch.text(subject, msgspec.json.encode(status))
+            self._outbox.put([(subject, text)], of=device_id)
+
     def _begin(self, device: ScannedDevice) -> Publisher:
         lease = self._placement.lease(device)
         publisher = Publisher(self._prefix, device.id, self._dialect, lease)

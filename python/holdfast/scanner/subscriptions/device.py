@@ -11,6 +11,7 @@ from holdfast.scanner.subscriptions.latest_values import LatestBlocks
 if TYPE_CHECKING:
     from collections.abc import Collection
 
+    from holdfast import tags
     from holdfast._core import Endpoint
     from holdfast.client.url import Target
     from holdfast.config.values.scanner_settings import Publish, Writes
@@ -48,6 +49,8 @@ class Subscriber:
     tags: dict[str, TagOptions] = field(default_factory=dict)
     ttl: int | None = None
     """Seconds after which the subscription ends, unless a request renews it."""
+    profile: str | None = None
+    """The profile whose tags it has, all of them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +60,11 @@ class TagOptions:
     writable: bool | None
     """`None` if the request leaves it out."""
     description: str | None
+
+    @staticmethod
+    def of_profile(tag: tags.Tag) -> TagOptions:
+        """Returns those of a subscriber to a whole profile."""
+        return TagOptions(tag.writable, tag.description or None)
 
 
 NO_OPTIONS = TagOptions(None, None)

@@ -20,7 +20,13 @@ from holdfast.scanner.subscriptions.conflicts import (
     merged,
     replaces,
 )
-from holdfast.scanner.subscriptions.device import ScannedDevice, Source, Subscriber
+from holdfast.scanner.subscriptions.device import (
+    NO_OPTIONS,
+    ScannedDevice,
+    Source,
+    Subscriber,
+    TagOptions,
+)
 from holdfast.scanner.subscriptions.health import Health
 
 if TYPE_CHECKING:
@@ -114,10 +120,15 @@ class Registry:
         subscriber.publish = subscription.publish
         subscriber.deadband = subscription.deadband
         subscriber.ttl = subscription.ttl
+        if subscription.profile is not None or self._dialect.replaces_subscription:
+            subscriber.profile = subscription.profile
         redefined = any(device.tags.get(id, tag) != tag for id, tag in subscription.tags.items())
         for tag in map(self._shared_tag, subscription.tags.values()):
             device.tags[tag.id] = tag
-            subscriber.tags[tag.id] = subscription.options[tag.id]
+            options = subscription.options[tag.id]
+            if options is NO_OPTIONS and tag.meaning and tag.profile == subscriber.profile:
+                options = TagOptions.of_profile(tag.meaning)
+            subscriber.tags[tag.id] = options
         for id in added:
             self._devices_of_tag.setdefault(id, set()).add(device.id)
             if (name := self._dialect.tag_name(id)) != id:
@@ -190,7 +201,8 @@ class Registry:
         before = device.rate
         ids = list(subscriber.tags) if request.ids is None else request.ids
         for id in ids:
-            subscriber.tags.pop(id, None)
+            if subscriber.tags.pop(id, None) and device.tags[id].profile == subscriber.profile:
+                subscriber.profile = None  # It has not all of its tags any more.
         if not subscriber.tags:
             del device.subscribers[request.subscriber_id]
         # `forget` keeps the tags that other subscribers use.

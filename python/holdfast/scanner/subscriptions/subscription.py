@@ -6,6 +6,8 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, urlsplit
 
+import msgspec
+
 from holdfast import tags
 from holdfast.client import url as urls
 from holdfast.client.url import STRICT, NetworkTarget, SerialTarget
@@ -55,6 +57,8 @@ class Subscription:
     deadband: float
     ttl: int | None
     """Seconds."""
+    profile: str | None
+    """The profile whose tags are among `tags`, all of them."""
 
 
 def subscription_of(
@@ -94,6 +98,7 @@ def subscription_of(
         publish,
         deadband if publish == "change" else 0.0,
         request.ttl,
+        request.profile,
     )
 
 
@@ -162,6 +167,18 @@ def requested_tags(
             adjustments.changes.append(("tag_repeated", made.id))
         found[made.id] = made
     return found, options
+
+
+def without_lost(request: SubscribeRequest, rules: Rules) -> tuple[SubscribeRequest, list[str]]:
+    """Returns a stored request without the tags that their profile has lost, and their ids."""
+    left, lost = [], []
+    for tag in request.tags:
+        profile = None if tag.profile is None else rules.profiles.get(tag.profile)
+        if profile is None or tag.id in profile:
+            left.append(tag)
+        else:
+            lost.append(tag.id)
+    return msgspec.structs.replace(request, tags=left), lost
 
 
 def _options(entry: TagRequest) -> TagOptions:
