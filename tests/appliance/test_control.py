@@ -1,11 +1,13 @@
-"""The socket for requests from the appliance's own machine, while connections can't be accepted."""
+"""The socket for requests from the appliance's own machine: who finds it, and that it recovers."""
 
 from __future__ import annotations
 
 import errno
 import os
+import sys
 import tempfile
 import threading
+from functools import partial
 from multiprocessing.connection import Listener
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,11 +43,24 @@ class Accepting:
 
 
 @pytest.fixture
-def accepting(monkeypatch: pytest.MonkeyPatch) -> Iterator[Accepting]:
+def runtime(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     # The path of a socket is short, and those of tests can be long.
-    with tempfile.TemporaryDirectory(prefix="hf") as runtime:
-        monkeypatch.setenv("RUNTIME_DIRECTORY", runtime)
-        yield Accepting(monkeypatch)
+    with tempfile.TemporaryDirectory(prefix="hf") as folder:
+        monkeypatch.setenv("RUNTIME_DIRECTORY", folder)
+        monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
+        yield Path(folder)
+
+
+@pytest.fixture
+def accepting(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Accepting:  # noqa: ARG001
+    return Accepting(monkeypatch)
+
+
+def pinged(file: Path) -> bool:
+    try:
+        return control.ask(file, "ping", within_s=wire.DEADLINE, ping_s=wire.DEADLINE) == {}
+    except control.NotRunning:
+        return False
 
 
 def test_it_pauses_after_an_error_and_a_stop_ends_the_pause(
@@ -67,7 +82,49 @@ def test_it_answers_again_after_errors(accepting: Accepting) -> None:
     accepting.failures = 2
     socket = Control(FILE, {})
     try:
-        assert control.ask(FILE, "ping", within_s=wire.DEADLINE, ping_s=wire.DEADLINE) == {}
+        assert pinged(FILE)
         assert accepting.calls > accepting.failures
     finally:
         socket.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs symbolic links")
+@pytest.mark.usefixtures("runtime")
+def test_it_is_found_by_its_path_when_a_symbolic_link_on_the_way_is_replaced(
+    tmp_path: Path,
+) -> None:
+    first, second, other = tmp_path / "first", tmp_path / "second", tmp_path / "other.yaml"
+    for folder in (first, second):
+        folder.mkdir()
+        (folder / "plant.yaml").touch()
+    link = tmp_path / "current"
+    link.symlink_to(first)
+    file = link / "plant.yaml"
+    other.symlink_to(first / "plant.yaml")
+    socket = Control(file, {})
+    try:
+        # Also by another path to the same file.
+        assert [pinged(each) for each in (file, first / "plant.yaml", other)] == [True] * 3
+        link.unlink()
+        link.symlink_to(second)
+        assert pinged(file)
+        assert not pinged(second / "plant.yaml")
+    finally:
+        socket.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs symbolic links")
+@pytest.mark.usefixtures("runtime")
+def test_of_two_appliances_each_is_found_by_the_path_that_it_was_started_with(
+    tmp_path: Path,
+) -> None:
+    file, link = tmp_path / "plant.yaml", tmp_path / "link.yaml"
+    file.touch()
+    link.symlink_to(file)
+    sockets = [Control(each, {"path": partial(dict, name=each.name)}) for each in (file, link)]
+    try:
+        for each in (file, link):
+            assert control.ask(each, "path")["name"] == each.name
+    finally:
+        for socket in sockets:
+            socket.close()

@@ -129,7 +129,7 @@ def hanging(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="hf") as runtime:
         monkeypatch.setenv("RUNTIME_DIRECTORY", runtime)
         file = tmp_path / "plant.yaml"
-        listener = Listener(control._own_address(file))
+        listener = Listener(control._own_addresses(file)[0])
         yield file
         listener.close()
 

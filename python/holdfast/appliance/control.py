@@ -1,7 +1,7 @@
 """Requests to a running appliance from its own machine: reload, list sessions, end one.
 
-A local socket (on Windows a named pipe) that only the user of the appliance can open. Its name
-follows from the path of the configuration. Requests and answers are JSON objects.
+A local socket (on Windows a named pipe) that only the user of the appliance, and root, can open.
+Its name follows from the path of the configuration. Requests and answers are JSON objects.
 """
 
 from __future__ import annotations
@@ -56,24 +56,37 @@ class Control:
     def __init__(self, file: Path, handlers: Mapping[str, Handler]) -> None:
         self._handlers: Mapping[str, Handler] = {"ping": dict, **handlers}
         self._closed = threading.Event()
-        self.address = _own_address(file)
-        self._listener = _listen(self.address)
-        self._thread = threading.Thread(target=self._accept, name="holdfast-control", daemon=True)
-        self._thread.start()
+        address, *others = _own_addresses(file)
+        self._listeners = {address: _listen(address)}
+        for address in others:
+            # Without it, only callers who name the file as it was named here are answered.
+            with contextlib.suppress(OSError):
+                self._listeners[address] = _listen(address)
+        self._threads = [
+            threading.Thread(
+                target=self._accept, args=(listener,), name="holdfast-control", daemon=True
+            )
+            for listener in self._listeners.values()
+        ]
+        for thread in self._threads:
+            thread.start()
 
     def close(self) -> None:
-        """Frees the socket."""
+        """Frees the sockets."""
         self._closed.set()
-        with contextlib.suppress(OSError, EOFError), Client(self.address):
-            pass  # Wakes the thread.
-        self._thread.join(TIMEOUT_S)
-        self._listener.close()
+        for address in self._listeners:
+            with contextlib.suppress(OSError, EOFError), Client(address):
+                pass  # Wakes the thread.
+        for thread in self._threads:
+            thread.join(TIMEOUT_S)
+        for listener in self._listeners.values():
+            listener.close()
 
-    def _accept(self) -> None:
+    def _accept(self, listener: Listener) -> None:
         backoff = Backoff(FIRST_PAUSE_S, MAX_PAUSE_S, jitter=False)
         while not self._closed.is_set():
             try:
-                connection = self._listener.accept()
+                connection = listener.accept()
             except (OSError, EOFError):
                 self._closed.wait(backoff.failed())
                 continue
@@ -168,16 +181,16 @@ def _is_alive(address: str) -> bool:
     return True
 
 
-def _own_address(file: Path) -> str:
-    """The address to listen at: in the first folder that this user can write to."""
+def _own_addresses(file: Path) -> list[str]:
+    """The addresses to listen at: in the first folder that this user can write to."""
     if sys.platform == "win32":
-        return _name(file)
+        return _names(file)
     problem: OSError | None = None
     for folder in _folders():
         try:
             folder.mkdir(mode=MODE, exist_ok=True)
             if folder.stat().st_uid == os.getuid() and os.access(folder, os.W_OK):
-                return str(folder / _name(file))
+                return [str(folder / name) for name in _names(file)]
         except OSError as error:
             problem = error
     raise problem or PermissionError("no folder for the control socket")
@@ -186,8 +199,9 @@ def _own_address(file: Path) -> str:
 def _addresses(file: Path) -> list[str]:
     """The addresses where the appliance of a configuration can be."""
     if sys.platform == "win32":
-        return [_name(file)]
-    return [str(folder / _name(file)) for folder in _folders() if not _is_forged(folder)]
+        return _names(file)
+    folders = [folder for folder in _folders() if not _is_forged(folder)]
+    return [str(folder / name) for folder in folders for name in _names(file)]
 
 
 def _is_forged(folder: Path) -> bool:
@@ -220,8 +234,14 @@ def _folders() -> Iterator[Path]:
     yield _temporary()
 
 
-def _name(file: Path) -> str:
-    digest = hashlib.sha256(str(file.resolve()).encode()).hexdigest()[:16]
+def _names(file: Path) -> list[str]:
+    """The names for a path as it is given, and for the file that its symbolic links lead to.
+
+    The first one stays the same when a link is replaced, the second one finds an appliance that was
+    started with another path to the same file.
+    """
+    paths = dict.fromkeys((os.path.normpath(file.absolute()), str(file.resolve())))
+    digests = [hashlib.sha256(path.encode()).hexdigest()[:16] for path in paths]
     if sys.platform == "win32":
-        return rf"\\.\pipe\holdfast-{digest}"
-    return f"{digest}.sock"
+        return [rf"\\.\pipe\holdfast-{digest}" for digest in digests]
+    return [f"{digest}.sock" for digest in digests]
