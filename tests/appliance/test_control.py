@@ -128,3 +128,35 @@ def test_of_two_appliances_each_is_found_by_the_path_that_it_was_started_with(
     finally:
         for socket in sockets:
             socket.close()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes have no folders")
+@pytest.mark.parametrize(
+    ("folder", "is_found"),
+    [
+        ("run/holdfast-two", True),
+        ("run/user/{user}/holdfast", True),
+        ("run/user/{other}/holdfast", False),
+        ("tmp/holdfast-{user}", True),
+        ("tmp/holdfast-{other}", False),
+        ("tmp/holdfast-two", False),
+    ],
+)
+def test_root_finds_appliances_of_others_in_folders_that_only_they_can_make(
+    runtime: Path, monkeypatch: pytest.MonkeyPatch, folder: str, is_found: bool
+) -> None:
+    user = os.getuid()
+    made = runtime / folder.format(user=user, other=user + 1)
+    made.mkdir(parents=True)
+    monkeypatch.setattr(control, "RUN", runtime / "run")
+    monkeypatch.setattr(tempfile, "tempdir", str(runtime / "tmp"))
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(made))
+    socket = Control(FILE, {})
+    monkeypatch.delenv("RUNTIME_DIRECTORY")
+    try:
+        monkeypatch.setattr(control, "_user", lambda: user + 2)
+        assert not pinged(FILE)
+        monkeypatch.setattr(control, "_user", lambda: 0)
+        assert pinged(FILE) == is_found
+    finally:
+        socket.close()

@@ -45,6 +45,9 @@ returns that error at once."""
 
 MODE = 0o700
 
+RUN = Path("/run")
+"""Only root makes folders in it; those in `user` are then the user's that they are named after."""
+
 
 class NotRunning(Exception):
     """No appliance with that configuration can be reached from here."""
@@ -201,6 +204,8 @@ def _addresses(file: Path) -> list[str]:
     if sys.platform == "win32":
         return _names(file)
     folders = [folder for folder in _folders() if not _is_forged(folder)]
+    if _user() == 0:
+        folders += [folder for folder in _folders_of_others() if folder not in folders]
     return [str(folder / name) for folder in folders for name in _names(file)]
 
 
@@ -230,8 +235,21 @@ def _folders() -> Iterator[Path]:
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if runtime:
         yield Path(runtime) / "holdfast"
-    yield Path("/run/holdfast")
+    yield RUN / "holdfast"
     yield _temporary()
+
+
+def _folders_of_others() -> Iterator[Path]:
+    """The folders of other units and users, for root, who may open their sockets."""
+    yield from sorted(RUN.glob("holdfast-*"))
+    named = [(folder, folder.parent.name) for folder in RUN.glob("user/*/holdfast")]
+    for folder in Path(tempfile.gettempdir()).glob("holdfast-*"):
+        named.append((folder, folder.name.removeprefix("holdfast-")))
+    for folder, user in sorted(named):
+        # Anybody can make folders for temporary files, with the number of somebody else.
+        with contextlib.suppress(OSError):
+            if str(folder.lstat().st_uid) == user:
+                yield folder
 
 
 def _names(file: Path) -> list[str]:
