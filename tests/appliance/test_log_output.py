@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import json
 import logging
 import os
 import threading
@@ -10,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.events import writer as log_output
+from holdfast.events.log_lines import LineFormatter
 from holdfast.events.writer import QueuedHandler
 from support import wire
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 
 @pytest.fixture
@@ -71,4 +75,77 @@ def test_a_reader_that_is_gone_holds_up_nobody(pipe: tuple[int, Any]) -> None:
     for _ in range(100):
         logged(handler, "x")
     handler.flush()
-    assert handler.dropped == 0
+    assert handler.dropped == 100
+
+
+class Disk:
+    """The file behind a stream, with `room` for this many more bytes."""
+
+    def __init__(self, path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.path, self.stream, self.room = path, path.open("w", encoding="utf-8"), 0
+        write = os.write
+
+        def written(descriptor: int, data: bytes) -> int:
+            if descriptor != self.stream.fileno():
+                return write(descriptor, data)
+            if not self.room:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            count = write(descriptor, data[: self.room])
+            self.room -= count
+            return count
+
+        monkeypatch.setattr(os, "write", written)
+
+
+@pytest.fixture
+def disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Disk]:
+    made = Disk(tmp_path / "log", monkeypatch)
+    with made.stream:
+        yield made
+
+
+@pytest.mark.parametrize(
+    ("room", "written", "lost"),
+    [
+        (0, [], 3),
+        (2, ["fi"], 3),
+        (5, ["first"], 2),
+        (6, ["first"], 2),
+        (9, ["first", "sec"], 2),
+        (18, ["first", "second", "third"], 0),
+    ],
+)
+def test_lines_that_a_full_disk_does_not_take_are_counted(
+    disk: Disk, room: int, written: list[str], lost: int
+) -> None:
+    handler = QueuedHandler(disk.stream)
+    disk.room = room
+    for text in ("first", "second", "third"):
+        logged(handler, text)
+        handler.flush()
+    assert (disk.path.read_text().splitlines(), handler.dropped) == (written, lost)
+    disk.room = 1000
+    logged(handler, "next")
+    handler.flush()
+    after = ["next", "log_dropped"] if lost else ["next"]
+    assert disk.path.read_text().splitlines() == written + after
+    assert handler.dropped == lost
+    logged(handler, "last")
+    handler.flush()
+    assert disk.path.read_text().splitlines()[-1] == "last"
+
+
+def test_a_note_that_is_lost_is_written_again_and_is_no_lost_line(disk: Disk) -> None:
+    handler = QueuedHandler(disk.stream)
+    handler.setFormatter(LineFormatter("json"))
+    for _ in range(3):
+        logged(handler, "x")
+        handler.flush()
+    disk.room = 1000
+    logged(handler, "next")
+    handler.flush()
+    events = [json.loads(line) for line in disk.path.read_text().splitlines()]
+    assert [(each["event"], each.get("count")) for each in events] == [
+        ("next", None),
+        ("log_dropped", 3),
+    ]

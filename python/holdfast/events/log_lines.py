@@ -42,7 +42,7 @@ def change(level: str, form: Format) -> None:
 
 
 def dropped() -> int:
-    """Returns the number of lines that were dropped because nobody read the log."""
+    """Returns the number of lines that nobody read, or that could not be written."""
     return sum(getattr(handler, "dropped", 0) for handler in LOGGER.handlers)
 
 

@@ -21,7 +21,10 @@ CLOSE_TIMEOUT_S = 1.0
 
 
 class QueuedHandler(logging.Handler):
-    """Queues lines for a stream. `dropped` counts those that found the queue full."""
+    """Queues lines for a stream.
+
+    `dropped` counts lines that found the queue full, or were not written completely.
+    """
 
     def __init__(self, stream: TextIO, timeout: float = CLOSE_TIMEOUT_S) -> None:
         """`timeout` is that of `flush`, in seconds."""
@@ -30,6 +33,8 @@ class QueuedHandler(logging.Handler):
         self._lines: deque[str] = deque()
         self._changed = threading.Condition()
         self._writing = False
+        self._ends_in_line = False
+        """Whether the last byte in the stream is no line feed: a full disk has cut off a line."""
         self._noted = 0
         self.dropped = 0
         threading.Thread(target=self._write_for_ever, name="holdfast-log", daemon=True).start()
@@ -61,11 +66,17 @@ class QueuedHandler(logging.Handler):
                 self._changed.wait_for(lambda: self._lines)
                 count = min(len(self._lines), MAX_LINES_PER_WRITE)
                 lines = [self._lines.popleft() for _ in range(count)]
-                missing, self._noted = self.dropped - self._noted, self.dropped
+                missing = self.dropped - self._noted
                 self._writing = True
             if missing:
                 lines.append(self._note(missing))
-            self._write("".join(lines))
+            lost = self._write("".join(lines))
+            with self._changed:
+                if not lost:
+                    self._noted += missing
+                elif missing:
+                    lost -= 1  # The note was the last line. It is written again with the next ones.
+                self.dropped += lost
 
     def _note(self, count: int) -> str:
         record = logging.makeLogRecord(
@@ -79,18 +90,28 @@ class QueuedHandler(logging.Handler):
         )
         return self.format(record) + "\n"
 
-    def _write(self, text: str) -> None:
-        """Writes without the lock of the stream, which the end of the program needs."""
+    def _write(self, text: str) -> int:
+        """Writes without the lock of the stream, which the end of the program needs.
+
+        Returns the number of lines that were not written completely.
+        """
         try:
             descriptor = self._stream.fileno()
         except (OSError, ValueError):  # It is no file.
             self._stream.write(text)
-            return
+            return 0
+        if self._ends_in_line:
+            text = "\n" + text
         data = text.encode(self._stream.encoding or "utf-8", "backslashreplace")
         while data:
             try:
-                data = data[os.write(descriptor, data) :]
+                count = os.write(descriptor, data)
             except BlockingIOError:
                 select.select([], [descriptor], [])
-            except OSError:
-                return  # Nobody reads it any more.
+            except OSError:  # The disk is full, or nobody reads it any more.
+                # A line that lacks only its line feed has it with the next write.
+                return data.removeprefix(b"\n").count(b"\n")
+            else:
+                self._ends_in_line = data[:count][-1:] != b"\n"
+                data = data[count:]
+        return 0

@@ -28,7 +28,7 @@ OUTCOMES = ("valid", "exceptions", "timeouts", "transport_errors")
 """The outcomes of requests to a device."""
 TOTALS = {
     "events_lost": "Listener events that were not logged.",
-    "log_dropped": "Log lines that were dropped because nobody read them.",
+    "log_dropped": "Log lines that nobody read, or that could not be written.",
     "tag_polls_dropped": "Polls whose values no output got, because too many came.",
 }
 """The counters without labels: their key and description."""
