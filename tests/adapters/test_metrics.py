@@ -366,6 +366,23 @@ def test_what_the_process_does_is_there(scraped: dict[tuple[str, ...], float]) -
         assert scraped["process_open_fds",] > 0
 
 
+def test_the_result_of_the_last_reload_is_there(
+    client: web.Client, diagnostics: Diagnostics
+) -> None:
+    def shown() -> list[float]:
+        seen = samples(client.get("/metrics").body.decode())
+        names = ("holdfast_reload_failed", "holdfast_reload_success_timestamp_seconds")
+        return [seen[name,] for name in names]
+
+    failed, start = shown()
+    assert (failed, start > 0) == (0, True)
+    diagnostics.note_reload(is_done=False)
+    assert shown() == [1, start]
+    diagnostics.note_reload(is_done=True)
+    failed, at = shown()
+    assert (failed, at >= start) == (0, True)
+
+
 def test_it_shows_the_moment(
     client: web.Client, memory_access: MemoryAccess, memories: dict[str, holdfast.Memory]
 ) -> None:

@@ -14,7 +14,7 @@ from holdfast.cli.configuration import load_whole
 from holdfast.cli.services import reloader
 from holdfast.cli.services.changed_files import FileSnapshot
 from holdfast.cli.services.reloader import Reloader
-from support import wire
+from support import web, wire
 from support.silent_files import Silent, threads
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from holdfast.config import Config
-    from support import web
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="files of other systems differ")
 
@@ -49,6 +48,7 @@ class Plant:
         self.file.write_text(text)
         self.config = load_whole(self.file)
         self.taken: list[Config] = []
+        self.diagnostics = web.diagnostics_of({})
         this: Any = self
         self.reloading = Reloader(
             this,
@@ -238,6 +238,20 @@ def test_a_wrong_file_is_refused_once(
     plant.step_until(lambda: log.of("reload_refused"), "it was refused")
     look_on(plant, looks)
     assert len(log.of("reload_refused")) == 1
+
+
+def test_the_diagnostics_have_the_result_of_the_last_reload(tmp_path: Path) -> None:
+    plant = Plant(tmp_path, HEAD.replace("on-change", "on-request"))
+    start = plant.diagnostics.stats()["reload"]
+    assert (start["failed"], start["succeeded_at"] > 0) == (False, True)
+    start["succeeded_at"] = 0
+    plant.replace("wrong")
+    assert "problems" in plant.request()
+    assert plant.diagnostics.stats()["reload"] == {"failed": True, "succeeded_at": 0}
+    plant.replace(HEAD)
+    assert "changed" in plant.request()
+    end = plant.diagnostics.stats()["reload"]
+    assert (end["failed"], end["succeeded_at"] > 0) == (False, True)
 
 
 def test_an_internal_error_of_reading_refuses_the_reload(

@@ -29,6 +29,15 @@ class Diagnostics:
     tag_values: Callable[[], list[Reading]]
     """Returns the last reading of each tag of the configured devices."""
     _began: float = field(default_factory=time.monotonic)
+    _reload: dict[str, Any] = field(
+        default_factory=lambda: {"failed": False, "succeeded_at": time.time()}
+    )
+    """The result of the last reload. The start counts as one."""
+
+    def note_reload(self, *, is_done: bool) -> None:
+        """Notes the result of a reload."""
+        succeeded_at = time.time() if is_done else self._reload["succeeded_at"]
+        self._reload = {"failed": not is_done, "succeeded_at": succeeded_at}
 
     def memories(self) -> dict[str, Any]:
         """Returns, for each memory, the start and size of its areas and the state of its seal."""
@@ -53,6 +62,7 @@ class Diagnostics:
             "uptime": round(time.monotonic() - self._began, 3),
             "adapters": {name: status for name, status in adapters if status is not None},
             "log_dropped": log_lines.dropped(),
+            "reload": self._reload,
             "threads": self._liveness.threads(),
         }
         for part in self._parts:

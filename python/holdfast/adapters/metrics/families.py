@@ -83,6 +83,16 @@ def all_metrics(diagnostics: DiagnosticsSource) -> Iterator[Metric]:
     yield GaugeMetricFamily("holdfast_uptime_seconds", "Time since start.", stats["uptime"])
     for key, text in TOTALS.items():
         yield CounterMetricFamily(f"holdfast_{key}", text, stats[key])
+    yield GaugeMetricFamily(
+        "holdfast_reload_failed",
+        "1 if the last reload was refused: the files are not the configuration that runs.",
+        stats["reload"]["failed"],
+    )
+    yield GaugeMetricFamily(
+        "holdfast_reload_success_timestamp_seconds",
+        "Unix time of the last reload that was not refused, or of the start.",
+        stats["reload"]["succeeded_at"],
+    )
     if stats["memory_files"]:
         files = {
             name: file | {"is_failing": file["failing"] is not None}

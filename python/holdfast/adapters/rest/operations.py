@@ -130,6 +130,7 @@ _STATS = json.loads(
      "adapters": {"rest": {"state": "running", "restarts": 0, "last_error": null, "accepted": 120,
         "values": 360, "reads": 4, "refused": {"invalid_value": 1}}},
      "events_lost": 0, "log_dropped": 0, "tag_polls_dropped": 0,
+     "reload": {"failed": false, "succeeded_at": 1893456000.0},
      "memory_files": {"/var/lib/holdfast/setpoints.redb": {"failing": null,
         "stored_at": 1893456000.0, "commits": 12, "pending": 0, "refused": 0, "busy": 0,
         "last_commit_seconds": 0.004, "bytes": 73728, "recreated": 0}},

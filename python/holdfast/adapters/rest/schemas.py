@@ -218,6 +218,13 @@ _DIAGNOSTICS: dict[str, Schema] = {
             "events_lost": COUNT,
             "log_dropped": COUNT,
             "tag_polls_dropped": COUNT,
+            "reload": object_of(
+                {
+                    "failed": BOOLEAN | {"description": "Whether the last reload was refused"},
+                    "succeeded_at": NUMBER
+                    | {"description": "Unix time of the last one that was not, or of the start"},
+                }
+            ),
             "memory_files": map_of(_MEMORY_FILE, "By path: the files that keep memories"),
             "logs": map_of(_LOG, "By name: the logs that memories are replicated through"),
             "audit": _AUDIT,

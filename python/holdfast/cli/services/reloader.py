@@ -131,6 +131,8 @@ class Reloader:
             reading, self._reading = self._reading, None
             with self._notification:
                 result = self._reload(reading)
+            if result:
+                self._appliance.diagnostics.note_reload(is_done="changed" in result)
             for future in self._served_requests:
                 future.set_result(result)
 
