@@ -183,7 +183,7 @@ def test_ids_of_memories_differ(folder: Folder) -> None:
     [
         ("'bad name'", "'bad name'", f"found 'bad name', allowed: {NAME}"),
         ("''", "''", f"found '', allowed: {NAME}"),
-        ("7", "7", f"found 7, allowed: {NAME}; write '7' to make it text"),
+        ("7", "7", f"found 7, allowed: {NAME}; quote it to make it text"),
     ],
 )
 def test_names_are_plain_text(folder: Folder, name: str, spelled: str, problem: str) -> None:
@@ -289,7 +289,7 @@ def test_limits_and_times_are_checked(folder: Folder, setting: str, problem: str
         ("{1: plant}", "{1: plan}",
          "9: units.1: found 'plan', allowed: plant; did you mean 'plant'?"),
         ("{1: plant}", "{1: 5}",
-         f"9: units.1: found 5, allowed: {NAME}; write '5' to make it text"),
+         f"9: units.1: found 5, allowed: {NAME}; quote it to make it text"),
         ("{1: plant}", "{1: plant, true: plant}",
          "9: units: found the key true, allowed: text or an integer; quote it to make it text"),
         ("read-only", "rw", "10: access: found 'rw', allowed: read-only or read-write"),
@@ -414,9 +414,9 @@ def test_listeners_need_sockets_of_their_own(folder: Folder, one: str, other: st
         ("log: {format: xml}", "log.format: found 'xml', allowed: text, json or ecs"),
         ("log:", "log: found nothing, allowed: a mapping with the keys level, format"),
         (
-            "identity: {revision: 1.0}",
-            "identity.revision: found 1.0, allowed: text of 1 to 244 bytes; "
-            "write '1.0' to make it text",
+            "identity: {revision: 1.10}",
+            "identity.revision: found 1.1, allowed: text of 1 to 244 bytes; "
+            "quote it to make it text",
         ),
         (
             "identity: {vendor_name: ''}",

@@ -136,7 +136,7 @@ def test_a_listener_for_rtu_over_tcp_is_checked_like_modbus_tcp(folder: Folder) 
         ("{}", "serial.device: missing, allowed: text, as in /dev/ttyUSB0 or COM3"),
         ("{device: ''}", "serial.device: found text of 0 bytes, allowed: text of 1 to 4095 bytes"),
         ("{device: 3}", "serial.device: found 3, allowed: text of 1 to 4095 bytes; "
-         "write '3' to make it text"),
+         "quote it to make it text"),
         ('{device: "a\\0"}', "serial.device: found 'a\\x00', allowed: text without '\\x00'"),
         ("{device: a, baud: 49}", "serial.baud: found 49, allowed: an integer from 50 to 4000000"),
         ("{device: a, baud: 4000001}",
@@ -310,7 +310,7 @@ def test_raw_ingest_of_format_v1_is_checked(
         ("[plant]", "[plant, plant]",
          "10: rules[0].memories[1]: found 'plant' again, allowed: once"),
         ("[plant]", "[7]",
-         f"10: rules[0].memories[0]: found 7, allowed: {NAME}; write '7' to make it text"),
+         f"10: rules[0].memories[0]: found 7, allowed: {NAME}; quote it to make it text"),
         ("[plant]", "[plant], units: {1: plant}",
          "10: rules[0].units: found with format crc, allowed: memories"),
     ],
@@ -426,7 +426,7 @@ def test_tcp_and_udp_share_a_port_number(folder: Folder) -> None:
         ("[engineer]", "[]", f"10: rules[0].roles: found an empty list, allowed: {SOME}"),
         ("[engineer]", "", f"10: rules[0].roles: found nothing, allowed: {SOME}"),
         ("[engineer]", "[5]", "10: rules[0].roles[0]: found 5, allowed: text of 0 to 255 bytes; "
-         "write '5' to make it text"),
+         "quote it to make it text"),
         ("[engineer]", "[a, a]", "10: rules[0].roles[1]: found 'a' again, allowed: once"),
     ],
 )  # fmt: skip

@@ -131,7 +131,7 @@ def test_a_serial_listener_has_routes_too(folder: Folder) -> None:
         ("{route: drive}", "{route: driv}", "13: listeners.scada.rules[0].units.7.route: found "
          "'driv', allowed: drive, bus; did you mean 'drive'?"),
         ("{route: drive}", "{route: 7}", "13: listeners.scada.rules[0].units.7.route: found 7, "
-         "allowed: 1 to 64 letters, digits, '_', '.' and '-'; write '7' to make it text"),
+         "allowed: 1 to 64 letters, digits, '_', '.' and '-'; quote it to make it text"),
         ("{route: drive}", "{}", "13: listeners.scada.rules[0].units.7.route: missing, allowed: "
          "text"),
         ("{route: drive}", "{route: drive, unit: 1}",

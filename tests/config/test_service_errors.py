@@ -275,7 +275,7 @@ def test_a_topic_filter_that_mqtt_allows_is_right(folder: Folder, topic: str) ->
         ("client_id: plant", "client_id: ''",
          "6: client_id: found text of 0 bytes, allowed: text of 1 to 65535 bytes"),
         ("client_id: plant", "client_id: 5", "6: client_id: found 5, allowed: text of 1 to 65535 "
-         "bytes; write '5' to make it text"),
+         "bytes; quote it to make it text"),
         ("  client", "  version: 4\n  client", "6: version: found 4, allowed: 5 or 3.1.1"),
         ("  client", "  version: 5.0\n  client", "6: version: found 5.0, allowed: 5 or 3.1.1"),
         ("  client", "  keep_alive: 0\n  client",
@@ -349,7 +349,7 @@ def test_a_topic_is_subscribed_once(folder: Folder) -> None:
         ("weather:", "mqtt:",
          f"5: adapters.mqtt: found 'mqtt', allowed: {OTHER}"),
         ("weather:", "gateway:", f"5: adapters.gateway: found 'gateway', allowed: {OTHER}"),
-        ("weather:", "7:", f"5: adapters.7: found 7, allowed: {NAME}; write '7' to make it text"),
+        ("weather:", "7:", f"5: adapters.7: found 7, allowed: {NAME}; quote it to make it text"),
         ("type: weather, ", "", "5: adapters.weather.type: missing, allowed: text"),
         ("type: weather", "type: a b", f"5: adapters.weather.type: found 'a b', allowed: {NAME}"),
         ("[plant]", "[othr]", "5: adapters.weather.memories[0]: found 'othr', "
@@ -362,7 +362,7 @@ def test_a_topic_is_subscribed_once(folder: Folder) -> None:
         ("read-only", "read-only, options: {a: {b: [.nan]}}",
          "5: adapters.weather.options.a: found nan, allowed: finite numbers"),
         ("read-only", "read-only, options: {7: 1}", "5: adapters.weather.options.7: found 7, "
-         "allowed: text; write '7' to make it text"),
+         "allowed: text; quote it to make it text"),
         ("{bind: 127.0.0.1:9464}", "{}", "6: metrics.bind: missing, allowed: text, as in "
          "0.0.0.0:502, 127.0.0.1:5020 or [::]:502"),
         ("{bind: 127.0.0.1:9464}", "{bind: '127.0.0.1:9464', sources: []}",

@@ -373,7 +373,7 @@ LISTENER = (
     "listeners: {s: {type: modbus-tcp, bind: '127.0.0.1:0', rules: ["
     "{sources: [127.0.0.1], access: read-only, units: {1: %s}}]}}\n"
 )
-QUOTES = "allowed: 1 to 64 letters, digits, '_', '.' and '-'; write '1' to make it text"
+QUOTES = "allowed: 1 to 64 letters, digits, '_', '.' and '-'; quote it to make it text"
 
 
 @pytest.mark.parametrize(

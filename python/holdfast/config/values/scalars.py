@@ -88,8 +88,7 @@ def is_name(value: object) -> TypeGuard[str]:
 def _name(value: object) -> str:
     if is_name(value):
         return value
-    quote = f"; write '{value}' to make it text" if type(value) is int else ""
-    raise ValueError(f"found {show(value)}, allowed: {NAME_FORM}{quote}")
+    raise ValueError(f"found {show(value)}, allowed: {NAME_FORM}{_quotable(value)}")
 
 
 def _raw_target(value: object) -> str:
@@ -121,7 +120,7 @@ def _adapter_name(value: object) -> str:
 def _option_name(value: object) -> str:
     if isinstance(value, str):
         return value
-    raise ValueError(f"found {show(value)}, allowed: text; write '{value}' to make it text")
+    raise ValueError(f"found {show(value)}, allowed: text{_quotable(value)}")
 
 
 def parse_sha256(value: object) -> str:
@@ -230,6 +229,14 @@ def _unquoted(value: object) -> str:
     return f"; write {value} without quotes" if is_integer else ""
 
 
+def _quotable(value: object) -> str:
+    """A hint for text without quotes that YAML takes for a number or a boolean, as in `1.10`.
+
+    It does not repeat the value, which is no longer as it was written.
+    """
+    return "; quote it to make it text" if isinstance(value, int | float) else ""
+
+
 def _sparkplug_id(value: object) -> str:
     text = _text_of(MAX_SPARKPLUG_ID)(value)
     for character in "+/#":
@@ -244,8 +251,7 @@ def _text_of(most: int, least: int = 1) -> Callable[[object], str]:
 
     def text(value: object) -> str:
         if not isinstance(value, str):
-            quote = f"; write '{value}' to make it text" if isinstance(value, int | float) else ""
-            raise ValueError(f"found {show(value)}, {allowed}{quote}")
+            raise ValueError(f"found {show(value)}, {allowed}{_quotable(value)}")
         for character in value:
             if unicodedata.category(character) in ("Cc", "Cs"):
                 raise ValueError(f"found {show(value)}, allowed: text without {character!r}")
