@@ -517,6 +517,8 @@ def test_initial_values_from_yaml_are_checked(folder: Folder, values: str, probl
         ('a: "D:\\data"', "1: not YAML: found unknown escape character 'd'; in double quotes, "
          "\\ begins an escape: write a path in single quotes, or with /"),
         ("a:\n\tb: 1", "2: not YAML: a tab indents this line, allowed: spaces"),
+        ("a:\n  b: 1\n  \tc: 2", "3: not YAML: a tab indents this line, allowed: spaces"),
+        ("a: 1\nb:\tc", "2: a tab before a value, allowed: spaces"),
         ("a:\n    b: 1\n  c: 2", "3: not YAML: indented unlike the keys above it, allowed: keys of "
          "one mapping begin in the same column"),
         (

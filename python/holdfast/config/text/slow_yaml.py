@@ -29,8 +29,10 @@ if TYPE_CHECKING:
 
 _QUOTES = "text that begins with [, { or a quote needs quotes around the whole, as in '[::1]:502'"
 
+_TAB = "found character '\\t' that cannot start any token"
+
 PLAIN_REASONS = {
-    "found character '\\t' that cannot start any token": "a tab indents this line, allowed: spaces",
+    _TAB: "a tab indents this line, allowed: spaces",
     "expected <block end>, but found '<block mapping start>'": (
         "indented unlike the keys above it, allowed: keys of one mapping begin in the same column"
     ),
@@ -59,6 +61,9 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
     line, column = (mark.line + 1, mark.column + 1) if mark else (None, None)
     reason = error.problem or error.context or "invalid syntax"
     start = error.context_mark
+    if reason == _TAB and mark and mark.buffer[mark.pointer - mark.column : mark.pointer].strip():
+        # It is YAML, but both parsers refuse it.
+        return Problem(file, line, column, "", "a tab before a value, allowed: spaces")
     if reason in PLAIN_REASONS:
         reason = PLAIN_REASONS[reason]
     elif error.context and start and mark and start.line != mark.line:
