@@ -11,6 +11,7 @@ from ipaddress import ip_network
 import pytest
 
 from holdfast._core import HttpServer
+from holdfast.events import log_lines
 from holdfast.net.http.host import ConnectionLimits, Host
 from holdfast.net.http.port import listen
 from holdfast.net.http.requests import Request, Response
@@ -66,3 +67,33 @@ def test_a_server_that_could_not_start_starts_later() -> None:
             with socket.create_connection(listener.getsockname(), wire.DEADLINE) as client:
                 client.sendall(b"\0\r\n\r\n")
                 assert client.recv(1000).endswith(b"no")
+
+
+def test_the_log_says_why_a_connection_can_not_be_accepted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    resource = pytest.importorskip("resource", reason="Windows has no limit of open files")
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    faults: list[dict[str, object]] = []
+    monkeypatch.setattr(log_lines, "refused", lambda _, **fields: faults.append(fields))
+    sources, limits = [ip_network("127.0.0.0/8")], ConnectionLimits(1)
+    with closing(listen("127.0.0.1", 0)) as listener, socket.socket() as client:
+        host = Host(
+            "x",
+            lambda _: Response(200),
+            listener,
+            sources=sources,
+            limits=limits,
+            request_timeout=wire.DEADLINE,
+        )
+        with web.in_a_thread(host):
+            with closing(web.Client(listener.getsockname())) as first:
+                assert first.get("/").status == 200
+            resource.setrlimit(resource.RLIMIT_NOFILE, (4, hard))
+            try:
+                client.connect(listener.getsockname())
+                wire.until(lambda: faults, "it was logged")
+            finally:
+                resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert faults[0]["message"] == "the system can't accept a connection"
+    assert "Too many open files" in str(faults[0]["error"])

@@ -324,22 +324,23 @@ class Host:
         """Logs what has happened to connections. Thread-safe."""
         for event, fields in server.events():
             if event == "accept_error":
-                self._log_fault("the system can't accept a connection")
+                self._log_fault("the system can't accept a connection", fields.get("error"))
             elif event != "secured":
                 kind = (self.name, event, fields.get("reason"))
                 log_lines.refused(event, kind=kind, listener=self.name, **fields)
 
     def _log_loop_error(self, loop: asyncio.AbstractEventLoop, context: Mapping[str, Any]) -> None:  # noqa: ARG002
         """Logs errors of the event loop."""
-        self._log_fault(context["message"], context.get("exception"))
+        error = context.get("exception")
+        self._log_fault(context["message"], error and f"{type(error).__name__}: {error}")
 
-    def _log_fault(self, message: str, error: BaseException | None = None) -> None:
+    def _log_fault(self, message: str, error: str | None) -> None:
         log_lines.refused(
             "listener_fault",
             kind=self.name,
             listener=self.name,
             message=message,
-            error="-" if error is None else f"{type(error).__name__}: {error}",
+            error=error or "-",
         )
 
 
