@@ -10,6 +10,7 @@ import click
 from holdfast.appliance.control import RELOAD_TIMEOUT_S, NotRunning, ask
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import config_argument
+from holdfast.cli.terminal_text import plain
 
 
 @click.command(epilog="Example: holdfast reload plant.yaml")
@@ -29,17 +30,17 @@ def reload(file: Path) -> None:
     except NotRunning as error:
         fail(error)
     if "incomplete" in answer:
-        click.echo(answer["incomplete"], err=True)
+        click.echo(plain(answer["incomplete"]), err=True)
         click.echo("A part of the configuration has changed. Restart the appliance.", err=True)
         sys.exit(ExitCode.ATTENTION)
     problems = answer.get("problems") or [answer[key] for key in ("error",) if key in answer]
     if problems:
         for problem in problems:
-            click.echo(problem, err=True)
+            click.echo(plain(problem), err=True)
         click.echo("Nothing has changed.", err=True)
         sys.exit(ExitCode.WRONG)
     # An appliance of an earlier version only logs its warnings.
     for warning in answer.get("warnings", ()):
-        click.echo(f"warning: {warning}", err=True)
-    changed = answer["changed"]
+        click.echo(f"warning: {plain(warning)}", err=True)
+    changed = [plain(key) for key in answer["changed"]]
     click.echo(f"Reloaded: {', '.join(changed)}" if changed else "Reloaded: nothing has changed")

@@ -57,8 +57,8 @@ def _end(file: Path, ending: str) -> None:
 
 def _row(session: dict[str, Any]) -> tuple[str, ...]:
     return (
-        f"{session['listener']}/{session['id']}",
-        session["peer"],
+        plain(f"{session['listener']}/{session['id']}"),
+        plain(session["peer"]),
         log_lines.timestamp(session["opened"]),
         f"{session['idle']:.1f} s",
         *(plain(session.get(key, "")) for key in ("role", "subject", "serial")),
