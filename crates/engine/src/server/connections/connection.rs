@@ -291,7 +291,9 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             self.reads_in_turn += 1;
             if self.answering.behind() > 0 {
                 self.renew()?;
-                len += self.answering.resume(&mut output[len..]);
+                let (written, taken) = self.answering.resume(&mut output[len..]);
+                len += written;
+                self.share.charge(taken);
             }
             self.deadlines.note_request(Instant::now());
             if len > 0 {
@@ -501,15 +503,16 @@ impl<F: Framing> Answering<F> {
     }
 
     /// Answers the requests that waited for others, as far as they need not wait any more. Returns the length of
-    /// the output.
-    fn resume(&mut self, output: &mut [u8]) -> usize {
+    /// the output, and the number of those requests.
+    fn resume(&mut self, output: &mut [u8]) -> (usize, u32) {
         let behind = self.deferred.as_mut().map(|deferred| deferred.resume()).unwrap_or_default();
-        let (mut rest, mut written) = (&behind[..], 0);
+        let (mut rest, mut written, mut taken) = (&behind[..], 0, 0);
         while let mbap::Next::Frame { transaction_id, unit_id, pdu, len } = mbap::next(rest) {
             written += self.take((transaction_id, unit_id, pdu), &mut output[written..]);
             rest = &rest[len..];
+            taken += 1;
         }
-        written
+        (written, taken)
     }
 
     /// Keeps an incomplete frame, which is shorter than the longest one.
