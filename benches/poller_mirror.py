@@ -31,7 +31,12 @@ poller = _core.Poller(
             interval=interval,
             timeout=5.0,
             reads=[
-                ("holding_registers", 50 * at, QUANTITY, (memory, "holding_registers", 20 * at))
+                (
+                    "holding_registers",
+                    50 * at,
+                    QUANTITY,
+                    (memory, "holding_registers", 20 * at, None),
+                )
                 for at in range(BLOCKS)
             ],
         )

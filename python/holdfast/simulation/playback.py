@@ -99,7 +99,7 @@ def _take(
 def _value(tag: Tag, cell: str) -> Any:
     """The value of a cell: a number before a state of that name, as states are recorded."""
     try:
-        if tag.is_float and cell in _INFINITIES:
+        if tag.is_float and tag.of_type.count is None and cell in _INFINITIES:
             return float(cell)
         if tag.is_number:
             return value_from(tag, cell, states=False)

@@ -74,13 +74,15 @@ class Publish(NamedTuple):
     is_retained: bool = False
     is_repeated: bool = False
     """Whether the broker delivers it again (DUP), because it was not acknowledged."""
+    lateness: str | None = None
+    """Why it may have been on its way for long; `None` if nothing says so."""
 
     @property
     def staleness(self) -> str | None:
         """Why the message may be old; `None` if nothing says so."""
         if self.is_retained:
             return "retained"
-        return "delivered again" if self.is_repeated else None
+        return "delivered again" if self.is_repeated else self.lateness
 
 
 def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: bool) -> Publish:

@@ -36,8 +36,8 @@ END_TIMEOUT_S = 2.5
 class Commands(CommandOutcomes):
     """The set topics of writable tags. A stale command must never be carried out.
 
-    Retained messages are ignored. The broker keeps no session, so one that is delivered again was
-    delivered over this connection before.
+    Retained and late messages are ignored. The broker keeps no session, so one that is delivered
+    again was delivered over this connection before.
     """
 
     def __init__(self, output: str, broker: str, names: TopicNames, site: Site) -> None:

@@ -82,7 +82,7 @@ class Connection(BrokerClient):
         writes: bool,
         proves: bool,
     ) -> None:
-        """`writes`: messages are commands, and one that may be late ends the connection.
+        """`writes`: messages are commands, and must not be late.
 
         `proves`: with a quality of service of 0, messages count as confirmed when the broker has
         answered a ping that follows them; otherwise, when they are written.
@@ -175,7 +175,7 @@ class Connection(BrokerClient):
         """Pings after the keep-alive time, and much more often while commands are taken. Ends the
         connection if the broker does not answer within the keep-alive time.
         """
-        if not self.is_accepted:
+        if not (self.is_accepted and self.is_open):
             return
         seconds = time.monotonic() - self._pinged_at
         keep_alive = self.keepalive or inf  # The broker may have set it to 0, which is none.
@@ -191,14 +191,14 @@ class Connection(BrokerClient):
         self._pinged_at, self._is_pinging = time.monotonic(), True
         self.connection.put(_PING)
 
-    def _check_age(self) -> None:
-        """Raises `ConnectionError` if what arrives may be late, because the network stood still.
+    def _lateness(self) -> str | None:
+        """Why what arrives may be late: the network stood still, or this side has much to send.
 
         The broker has sent it after it answered the last answered ping: it is no older than that.
         """
         age = time.monotonic() - self._answered_at
-        if age > MAX_COMMAND_AGE_S:
-            raise ConnectionError(f"a message may be {age:.0f} s late: no ping was answered since")
+        late = f"it may be {age:.0f} s late: no ping was answered since"
+        return late if age > MAX_COMMAND_AGE_S else None
 
     @staticmethod
     def _confirm(deliveries: list[Delivery]) -> bool:
@@ -298,8 +298,8 @@ class Connection(BrokerClient):
 
     def _received(self, first: int, body: bytes | bytearray, size: int) -> None:
         message = parse_publish(first, body, size, five=self._five)
-        if self._writes and message.staleness is None:  # Others are never carried out.
-            self._check_age()
+        if self._writes:
+            message = message._replace(lateness=self._lateness())
         if message.qos == 1:
             self.connection.put(acknowledgement(PUBACK, message.identifier))
         elif message.qos == 2:

@@ -68,8 +68,8 @@ class Session:
         """`qos` is of all messages, and of the will unless it has its own. For `on_refused` and
         `proves`, see `Connection`.
 
-        With `writes`, messages are commands. If this process or the network stood still, the
-        connection ends, and the broker drops the commands that waited: they are too late.
+        With `writes`, messages are commands. If this process stood still, the connection ends, and
+        the broker drops the commands that waited: they are too late.
         """
         self._standstill = Standstill("output") if writes else None
         self._on_command, self._on_refused = on_command, on_refused

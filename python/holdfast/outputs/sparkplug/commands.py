@@ -43,8 +43,8 @@ class Commands(CommandOutcomes):
     def take(self, message: Publish, device: str | None) -> None:
         """Carries out a message for a device, or for the node.
 
-        A stale command must never be carried out: retained messages are ignored, and those that
-        are delivered again, which can only be over the same connection.
+        A stale command must never be carried out: retained and late messages are ignored, and
+        those that are delivered again, which can only be over the same connection.
         """
         try:
             if message.staleness is not None:

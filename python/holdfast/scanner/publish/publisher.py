@@ -7,7 +7,7 @@ costs only its own JSON and joining it with them.
 
 from __future__ import annotations
 
-from itertools import compress
+from itertools import compress, repeat
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
@@ -181,13 +181,17 @@ class Publisher:
         values = part.decoder(data)
         if part.needs_cleaning:
             values = [tag.value(raw) for raw, tag in zip(values, part.tags, strict=True)]
+        selected = self._filtered(part, values) if part.needs_filter else repeat(True)
+        if part.has_meanings:  # What is not published does not need its digits.
+            values = [
+                tag.published(value) if is_published and type(value) is not Undecoded else value
+                for value, tag, is_published in zip(values, part.tags, selected, strict=False)
+            ]
         if part.is_plain_json:  # One call for all values, instead of one for each.
             texts = _encode(values)[1:-1].split(b",")
         else:
             texts = [b"null" if type(value) is Undecoded else _encode(value) for value in values]
-        rows: Iterator[Any] = zip(part.ids, part.templates, texts, strict=True)
-        if part.needs_filter:
-            rows = compress(rows, self._filtered(part, values))
+        rows: Iterator[Any] = compress(zip(part.ids, part.templates, texts, strict=True), selected)
         end, digits = timestamp + b"}\r\n", len(timestamp)
         join, sizes = b"".join, _SIZES
         return [
@@ -254,6 +258,7 @@ class Publisher:
             [scheduled.deadbands[tag.id] for tag in tags],
             is_plain_json=is_infallible,
             needs_cleaning=remembered or any(tag.null or tag.meaning is not None for tag in tags),
+            has_meanings=any(tag.meaning is not None for tag in tags),
             change=group.change,
             needs_filter=remembered or not is_infallible,
         )
@@ -303,6 +308,8 @@ class _BlockPart(NamedTuple):
     """Whether all values can be encoded as one JSON array and split at the commas."""
     needs_cleaning: bool
     """Whether some values must be converted, such as NaN or a marker to `null`."""
+    has_meanings: bool
+    """Whether some tags are from profiles."""
     change: bool
     needs_filter: bool
     """Whether some values may be omitted, or must be remembered."""

@@ -65,7 +65,9 @@ class LatestBlocks:
             return None
         time, address, data = found
         value = value_of(tag, data, address)
-        return Latest(None if type(value) is Undecoded else tag.value(value), time)
+        if type(value) is Undecoded:
+            return Latest(None, time)
+        return Latest(tag.published(tag.value(value)), time)
 
     def _forget_inside(self, area: Area, start: int, end: int) -> None:
         """Removes the blocks that a new one contains, and the oldest if there are too many."""

@@ -55,17 +55,18 @@ class Tag(BaseTag):
         return None if self.meaning is None else self.meaning.source
 
     def value(self, raw: Any) -> Any:
-        """The value of what the registers hold; `None` if none is available.
-
-        That of a profile is as outputs publish it, with the digits of its type.
-        """
+        """The value of what the registers hold; `None` if none is available."""
         if type(raw) is Undecoded:
             return raw
         if self.meaning is not None:
-            return plain(self.meaning, self.meaning.value(raw))
+            return self.meaning.value(raw)
         if type(raw) is list:
             return [None if self.is_null(item) else item for item in raw]
         return None if self.is_null(raw) else raw
+
+    def published(self, value: Any) -> Any:
+        """A value as it is published: that of a profile with the digits of its type, as by outputs."""
+        return value if self.meaning is None else plain(self.meaning, value)
 
     def scaled(self, raw: Any, content: Any) -> Scaled:
         """The value, from its registers and the register that contains its scale."""
