@@ -233,7 +233,8 @@ class Polled(Asking):
     def _device(self, unit: int) -> PolledDevice:
         base = BASE * (unit - 1)
         reads: list[Any] = [
-            (area, address, COUNT, (self.memory, area, base + address)) for area, address in BLOCKS
+            (area, address, COUNT, (self.memory, area, base + address, None))
+            for area, address in BLOCKS
         ]
         return PolledDevice(
             str(unit),

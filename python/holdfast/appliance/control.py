@@ -143,19 +143,25 @@ def ask(
 
 
 def _answered(file: Path, request: bytes) -> dict[str, Any] | NotRunning:
-    for address in _addresses(file):
-        try:
-            connection = Client(address)
-        except OSError:
-            continue
+    own, others = _addresses(file), _addresses_of_others(file)
+    connection = next(filter(None, map(_connected, own)), None)
+    if connection is None:
+        alive = {Path(each).parent: found for each in others if (found := _connected(each))}
+        if len(alive) > 1:  # Every user can say so. Who is right is not known.
+            folders = ", ".join(map(str, alive))
+            return NotRunning(f"{file}: several users say that they run it, in {folders}")
+        connection = next(iter(alive.values()), None)
+    if connection is not None:
         with connection:
             try:
                 connection.send_bytes(request)
-                answer: dict[str, Any] = json.loads(connection.recv_bytes(MAX_ANSWER_BYTES))
+                answer = json.loads(connection.recv_bytes(MAX_ANSWER_BYTES))
             except (OSError, EOFError):
                 return NotRunning(f"{file}: the appliance ended the connection")
-        return answer
-    tried = ", ".join(_addresses(file))
+            except ValueError:
+                answer = None
+        return answer if isinstance(answer, dict) else NotRunning(f"{file}: not an appliance")
+    tried = ", ".join((*own, *others))
     # An appliance can run a file that is gone, so this is looked at last.
     missing = "" if file.exists() else "no such file, and "
     none = f"{missing}no appliance of this user runs it on this machine"
@@ -177,11 +183,17 @@ def _listen(address: str) -> Listener:
 
 
 def _is_alive(address: str) -> bool:
+    found = _connected(address)
+    if found is not None:
+        found.close()
+    return found is not None
+
+
+def _connected(address: str) -> Any:  # A connection, of another type on Windows; or None.
     try:
-        Client(address).close()
+        return Client(address)
     except OSError:
-        return False
-    return True
+        return None
 
 
 def _own_addresses(file: Path) -> list[str]:
@@ -203,9 +215,16 @@ def _addresses(file: Path) -> list[str]:
     """The addresses where the appliance of a configuration can be."""
     if sys.platform == "win32":
         return _names(file)
-    folders = [folder for folder in _folders() if not _is_forged(folder)]
-    if _user() == 0:
-        folders += [folder for folder in _folders_of_others() if folder not in folders]
+    folders = (folder for folder in _folders() if not _is_forged(folder))
+    return [str(folder / name) for folder in folders for name in _names(file)]
+
+
+def _addresses_of_others(file: Path) -> list[str]:
+    """The addresses where that of another user or unit can be, for root."""
+    if sys.platform == "win32" or _user() != 0:
+        return []
+    own = list(_folders())
+    folders = (folder for folder in _folders_of_others() if folder not in own)
     return [str(folder / name) for folder in folders for name in _names(file)]
 
 

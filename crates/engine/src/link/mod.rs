@@ -21,6 +21,7 @@ pub(crate) use caller::Waiting;
 pub use caller::{Called, Caller};
 pub use fault::Fault;
 pub(crate) use fault::{confirmation, exception, exception_code, exception_in, fault};
+pub(crate) use limits::circuit_breaker::Down;
 pub use limits::lease_fence::{Fence, Stage};
 pub(crate) use limits::lease_fence::{Pass, submit_under};
 pub(crate) use limits::permit::{Permit, Wanted};

@@ -17,7 +17,7 @@ use super::destination::ReadSettings;
 use crate::client::ClientError;
 use crate::items::{Items, touched};
 use crate::link::{
-    Caller, Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, Wanted,
+    Caller, Down, Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, Wanted,
     confirmation, exception, exception_code, exception_in, fault, pending_reply, submit_under,
 };
 
@@ -252,7 +252,8 @@ impl PassedWrite {
         }
         let function = self.request.pdu()[0];
         // What waits for a silent unit must not reach it in a burst when it is back.
-        let is_down = link.admit(unit_id, function).is_err() || link.retry_at().is_some();
+        let is_silent = link.admit(unit_id, function) == Err(Down::Unit);
+        let is_down = is_silent || link.retry_at().is_some();
         if is_down || !self.is_mirrored(reads) {
             self.refuse(ExceptionCode::GatewayPathUnavailable);
             return Vec::new();
@@ -301,7 +302,10 @@ impl PassedWrite {
         if outcome == Err(Fault::Expired) {
             return Vec::new();
         }
-        link.record((unit_id, function), outcome);
+        // Without the lease, nothing was sent.
+        if outcome != Err(Fault::Standby) {
+            link.record((unit_id, function), outcome);
+        }
         match answered {
             Ok(answer) => self.confirm(&answer, value, reads, permit).await,
             Err(error) => {

@@ -11,7 +11,7 @@ import click
 from holdfast.appliance.control import NotRunning, ask
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import config_argument, json_option
-from holdfast.cli.terminal_text import print_json, table
+from holdfast.cli.terminal_text import plain, print_json, table
 from holdfast.events import log_lines
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def _is_well(status: dict[str, Any]) -> bool:
 
 
 def _shown(name: str, status: dict[str, Any]) -> list[str]:
-    where = f"connected to {status['server']}" if status["connected"] else "not connected"
+    where = f"connected to {plain(status['server'])}" if status["connected"] else "not connected"
     contact = status["contact_age"]
     lines = [
         f"log {name}: {status['phase']}, {where}",
@@ -68,11 +68,11 @@ def _shown(name: str, status: dict[str, Any]) -> list[str]:
         state = "running" if server["running"] else "not running"
         lines.append(f"  embedded server: {state}, started again {server['restarts']} times")
     if status["failure"] is not None:
-        lines.append(f"  failed: {status['failure'][1]}")
+        lines.append(f"  failed: {plain(status['failure'][1])}")
     elif status["obstacle"] is not None:
-        lines.append(f"  not caught up: {status['obstacle']}")
+        lines.append(f"  not caught up: {plain(status['obstacle'])}")
         if status["last_error"] is not None:
-            lines.append(f"  last error: {status['last_error']}")
+            lines.append(f"  last error: {plain(status['last_error'])}")
     rows = (_row(node, status) for node in status["nodes"])
     lines += (f"  {line}" for line in table(_HEAD, rows))
     if devices := status["devices"]:
@@ -82,9 +82,9 @@ def _shown(name: str, status: dict[str, Any]) -> list[str]:
 
 
 def _polled(device: str, found: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    yield device, "nobody" if found["node"] is None else found["node"]
+    yield plain(device), "nobody" if found["node"] is None else plain(found["node"])
     if (reason := found.get("reason")) is not None:
-        yield "", reason
+        yield "", plain(reason)
 
 
 def _row(node: dict[str, Any], status: dict[str, Any]) -> tuple[str, ...]:
@@ -92,4 +92,4 @@ def _row(node: dict[str, Any], status: dict[str, Any]) -> tuple[str, ...]:
     own = node["name"] == status["node"]
     at, digest, *_ = (status if own else node)["digest"] or ("", "")
     when = log_lines.timestamp(node["time_ns"] / 1e9)
-    return node["name"], str(node["sequence"]), when, str(at), digest[:_DIGEST]
+    return plain(node["name"]), str(node["sequence"]), when, str(at), digest[:_DIGEST]

@@ -65,7 +65,7 @@ class Tag(BaseTag):
         return None if self.is_null(raw) else raw
 
     def published(self, value: Any) -> Any:
-        """A value as it is published: that of a profile with the digits of its type, as by outputs."""
+        """A value as it is published: that of a profile with the digits of its type."""
         return value if self.meaning is None else plain(self.meaning, value)
 
     def scaled(self, raw: Any, content: Any) -> Scaled:
