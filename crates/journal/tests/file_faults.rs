@@ -411,6 +411,23 @@ fn another_file_is_never_replaced() {
 
 #[cfg(unix)]
 #[test]
+fn what_is_no_file_is_never_replaced_and_nothing_is_stored_there() {
+    let put: [fn(&Path); 2] = [
+        |path| std::fs::create_dir(path).unwrap(),
+        |path| std::os::unix::fs::symlink("nothing", path).unwrap(),
+    ];
+    for put in put {
+        let (path, one, file) = kept("no file", patient());
+        std::fs::remove_file(&path).unwrap();
+        put(&path);
+        assert_eq!(set(&one, 1, 2), NOT_STORED);
+        assert!(matches!(file.stop(), Err(FileError::Foreign(_))));
+        assert_eq!(file.status().pending, 1, "nothing of it is on the disk");
+    }
+}
+
+#[cfg(unix)]
+#[test]
 fn a_folder_that_is_gone_refuses_steps_until_it_is_back() {
     let (path, one, file) = kept("folder", patient());
     let (folder, moved) = (path.parent().unwrap(), path.parent().unwrap().with_extension("moved"));

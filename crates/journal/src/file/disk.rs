@@ -176,8 +176,12 @@ impl Disk for FileOnDisk {
 
     fn is_in_place(&self) -> Result<bool, FileError> {
         let Some(found) = self.found()? else { return Ok(false) };
-        match &*lock(&self.opened) {
-            Some(opened) if is_same(&opened.metadata()?, &found) => Ok(true),
+        match lock(&self.opened).as_ref().map(fs::File::metadata) {
+            Some(Ok(opened)) if is_same(&opened, &found) => Ok(true),
+            // NFS may know nothing more of a file that is gone.
+            Some(Err(error)) if error.kind() != io::ErrorKind::StaleNetworkFileHandle => {
+                Err(error.into())
+            }
             Some(_) => Err(FileError::Replaced),
             None => Err(FileError::Locked),
         }

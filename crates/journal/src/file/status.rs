@@ -25,6 +25,6 @@ pub struct Status {
     pub recreated: u64,
     /// Since when the disk has not answered.
     pub(super) busy_since: Option<Instant>,
-    /// Nothing of the contents is in the file: it is gone, or another one is in its place.
+    /// Nothing of the contents is in the file: it is gone, or something else is in its place.
     pub(super) is_away: bool,
 }

@@ -82,8 +82,9 @@ impl Store {
         let began = Instant::now();
         self.note(|status| status.busy_since = Some(began));
         let stored = self.try_store(changes);
-        let is_away = stored.is_err()
-            && matches!(self.disk.is_in_place(), Ok(false) | Err(FileError::Replaced));
+        // After an I/O error, the file may be in its place.
+        let is_away =
+            stored.is_err() && !matches!(self.disk.is_in_place(), Ok(true) | Err(FileError::Io(_)));
         let bytes = self.bytes();
         self.note(|status| {
             (status.busy_since, status.is_away) = (None, is_away);
