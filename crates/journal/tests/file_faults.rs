@@ -426,6 +426,44 @@ fn what_is_no_file_is_never_replaced_and_nothing_is_stored_there() {
     }
 }
 
+/// An unmounted file system leaves the empty folder of its mount point. Here a link leads to one.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_file_system_that_is_gone_refuses_steps_until_it_is_back() {
+    use std::os::unix::fs::{MetadataExt, symlink};
+    let mounted = Path::new("/dev/shm").join(format!("holdfast-{}", std::process::id()));
+    let (path, _, file) = kept("mounted", patient());
+    file.stop().unwrap();
+    let empty = path.parent().unwrap();
+    std::fs::remove_file(&path).unwrap();
+    let _ = std::fs::remove_dir_all(&mounted);
+    std::fs::create_dir(&mounted).unwrap();
+    let device = |path: &Path| std::fs::metadata(path).unwrap().dev();
+    assert_ne!(device(&mounted), device(empty), "the test needs two file systems");
+    let link = empty.with_extension("link");
+    let lead_to = |folder: &Path| {
+        let _ = std::fs::remove_file(&link);
+        symlink(folder, &link).unwrap();
+    };
+    lead_to(&mounted);
+    let (path, one) = (link.join("memories.redb"), memory(layout(0, 1000), None));
+    let file = keep(&Arc::new(FileOnDisk::new(&path)), &[("one", &one)], patient()).unwrap();
+    set(&one, 0, 1).unwrap();
+    lead_to(empty);
+    assert_eq!(set(&one, 1, 2), NOT_STORED);
+    assert!(file.status().failing.unwrap().starts_with("its folder is gone, or on another file"));
+    assert_eq!(std::fs::read_dir(empty).unwrap().count(), 0);
+    lead_to(&mounted);
+    set(&one, 1, 3).unwrap();
+    assert_eq!(after_a_kill(&path), (1, 3));
+    assert_eq!((file.status().failing, file.status().recreated), (None, 0));
+    lead_to(empty);
+    assert!(matches!(file.stop(), Err(FileError::FolderGone)));
+    assert_eq!(file.status().pending, 2, "nothing of it is found");
+    assert_eq!(std::fs::read_dir(empty).unwrap().count(), 0);
+    std::fs::remove_dir_all(&mounted).unwrap();
+}
+
 #[cfg(unix)]
 #[test]
 fn a_folder_that_is_gone_refuses_steps_until_it_is_back() {

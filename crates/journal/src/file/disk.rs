@@ -43,7 +43,7 @@ pub trait Disk: fmt::Debug + Send + Sync {
     /// Whether the file that was opened or installed last is still there; `false` if there is no file.
     ///
     /// # Errors
-    /// [`FileError::Replaced`] if another file is there, and as [`Disk::size`].
+    /// [`FileError::Replaced`] if another file is there, [`FileError::FolderGone`], and as [`Disk::size`].
     fn is_in_place(&self) -> Result<bool, FileError>;
 
     /// Puts what was created in the place of the file, durably. A file that is not the one that was opened
@@ -66,8 +66,16 @@ pub struct FileOnDisk {
     path: PathBuf,
     /// Is created first. The name is of this process: two that start at once don't share it.
     beside: PathBuf,
-    /// The file that was opened or installed last. While this is open, no other file has its number.
-    opened: Mutex<Option<fs::File>>,
+    opened: Mutex<Option<Opened>>,
+}
+
+/// The file that was opened or installed last.
+#[derive(Debug)]
+struct Opened {
+    /// While this is open, no other file has its number.
+    file: fs::File,
+    /// Its file system is compared, because that of a file may have another number, as on overlayfs.
+    folder: fs::Metadata,
 }
 
 impl FileOnDisk {
@@ -83,11 +91,9 @@ impl FileOnDisk {
     /// Removes files beside this one, left by processes that were killed while they created them. A process
     /// that creates one now does not have this file open, and fails.
     fn sweep(&self) {
-        let (Some(folder), Some(name)) = (self.path.parent(), self.path.file_name()) else {
-            return;
-        };
+        let Some(name) = self.path.file_name() else { return };
         let prefix = format!("{}.", name.to_string_lossy());
-        for entry in fs::read_dir(folder).into_iter().flatten().flatten() {
+        for entry in fs::read_dir(self.folder()).into_iter().flatten().flatten() {
             let found = entry.file_name();
             let process = found.to_str().and_then(|found| found.strip_prefix(&*prefix));
             let process = process.and_then(|rest| rest.strip_suffix(".new"));
@@ -128,10 +134,14 @@ impl FileOnDisk {
         Ok(Some(found))
     }
 
+    fn folder(&self) -> &Path {
+        let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        folder.unwrap_or(Path::new("."))
+    }
+
     #[cfg(unix)]
     fn sync_folder(&self) -> io::Result<()> {
-        let folder = self.path.parent().filter(|folder| !folder.as_os_str().is_empty());
-        fs::File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
+        fs::File::open(self.folder())?.sync_all()
     }
 
     /// Windows has no way to sync a folder.
@@ -148,7 +158,8 @@ impl Disk for FileOnDisk {
 
     fn open(&self, builder: &Builder) -> Result<Database, FileError> {
         // First, so that a file that takes its place in between is noticed as another one.
-        let opened = fs::File::open(&self.path)?;
+        let folder = fs::metadata(self.folder())?;
+        let opened = Opened { file: fs::File::open(&self.path)?, folder };
         let database = builder.open(&self.path)?;
         *lock(&self.opened) = Some(opened);
         self.sweep();
@@ -175,22 +186,33 @@ impl Disk for FileOnDisk {
     }
 
     fn is_in_place(&self) -> Result<bool, FileError> {
-        let Some(found) = self.found()? else { return Ok(false) };
-        match lock(&self.opened).as_ref().map(fs::File::metadata) {
-            Some(Ok(opened)) if is_same(&opened, &found) => Ok(true),
+        let found = self.found()?;
+        let opened = lock(&self.opened);
+        let Some(Opened { file, folder }) = &*opened else {
+            return if found.is_none() { Ok(false) } else { Err(FileError::Locked) };
+        };
+        let Some(found) = found else {
+            // A mount point that is empty has no file either, but that is back with its file system.
+            return match fs::metadata(self.folder()) {
+                Ok(found) if is_on_same_file_system(folder, &found) => Ok(false),
+                _ => Err(FileError::FolderGone),
+            };
+        };
+        match file.metadata() {
+            Ok(opened) if is_same(&opened, &found) => Ok(true),
             // NFS may know nothing more of a file that is gone.
-            Some(Err(error)) if error.kind() != io::ErrorKind::StaleNetworkFileHandle => {
+            Err(error) if error.kind() != io::ErrorKind::StaleNetworkFileHandle => {
                 Err(error.into())
             }
-            Some(_) => Err(FileError::Replaced),
-            None => Err(FileError::Locked),
+            _ => Err(FileError::Replaced),
         }
     }
 
     fn install(&self) -> Result<(), FileError> {
-        let created = fs::File::open(&self.beside)?;
+        let folder = fs::metadata(self.folder())?;
+        let created = Opened { file: fs::File::open(&self.beside)?, folder };
         // NFS may know nothing more of a file that is gone.
-        if let Some(Ok(old)) = lock(&self.opened).as_ref().map(fs::File::metadata) {
+        if let Some(Ok(old)) = lock(&self.opened).as_ref().map(|opened| opened.file.metadata()) {
             fs::set_permissions(&self.beside, old.permissions())?;
         }
         if self.is_in_place()? {
@@ -224,8 +246,20 @@ fn is_same(one: &fs::Metadata, other: &fs::Metadata) -> bool {
     (one.dev(), one.ino()) == (other.dev(), other.ino())
 }
 
+#[cfg(unix)]
+fn is_on_same_file_system(one: &fs::Metadata, other: &fs::Metadata) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    one.dev() == other.dev()
+}
+
 /// The standard library does not show the number of a file on Windows.
 #[cfg(not(unix))]
 fn is_same(_: &fs::Metadata, _: &fs::Metadata) -> bool {
+    true
+}
+
+/// Nor that of a file system.
+#[cfg(not(unix))]
+fn is_on_same_file_system(_: &fs::Metadata, _: &fs::Metadata) -> bool {
     true
 }

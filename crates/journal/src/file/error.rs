@@ -25,6 +25,11 @@ pub enum FileError {
          a start would load the other file"
     )]
     Replaced,
+    /// The file is gone with its folder, or with the file system that was mounted there.
+    #[error(
+        "its folder is gone, or on another file system. Put the folder back, or mount its file system again"
+    )]
+    FolderGone,
     #[error("{0}")]
     Io(#[from] io::Error),
     /// The file does not fit the log of its memories.

@@ -12,8 +12,9 @@
 //!   is stored with them. The file is never their journal.
 //! * After an I/O error, the contents of the disk are unknown. So the next transaction writes a new file and
 //!   puts it in the place of the old one.
-//! * If the file is gone, a new one with all contents takes its place before a step is answered. Another
-//!   file that is there is never replaced: that is an error until it is gone.
+//! * If the file is gone, a new one with all contents takes its place before a step is answered; but not if
+//!   its folder or file system is gone. Another file that is there is never replaced: that is an error until
+//!   it is gone.
 //! * A file that is not entirely as it was stored is refused, and not changed. It is never replaced by
 //!   an empty one.
 
