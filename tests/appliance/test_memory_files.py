@@ -9,13 +9,17 @@ import signal
 import socket
 import urllib.error
 import urllib.request
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 import holdfast
+from holdfast import _core
 from holdfast._core import UnusableMemoryFile
 from holdfast.appliance import Appliance
+from holdfast.appliance.parts.memories import Memories, created
+from holdfast.appliance.parts.part import Plan
 from holdfast.appliance.reload import ReloadRefused
 from holdfast.config import load
 from support import wire
@@ -24,6 +28,8 @@ from support.config_folder import Folder, written
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from support import web
 
 Settings = dict[str, Any]
 
@@ -399,6 +405,59 @@ def test_another_file_in_the_place_of_its_own_is_not_changed(plant: Plant) -> No
     assert code == 1
     assert " error memory_file_lost " in log
     assert file.read_bytes() == b"other"
+
+
+class FakeFile:
+    """In the place of a `MemoryFile`, with a status as given."""
+
+    loaded = ("plant",)
+    warnings = ()
+    failing: str | None = None
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def start(self) -> None:
+        pass
+
+    def stop(self) -> None:
+        pass
+
+    def status(self) -> dict[str, Any]:
+        return {"failing": self.failing, "pending": 0, "recreated": 0}
+
+
+@pytest.fixture
+def part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Memories:
+    """Has one file, a `FakeFile`."""
+    monkeypatch.setattr(_core, "MemoryFile", FakeFile)
+    settings = config(tmp_path)
+    memories = {"plant": created(settings, "plant")}
+    made = Memories(settings, memories)
+    made.open(Plan(settings, (), memories, ExitStack()))
+    return made
+
+
+def test_a_reason_is_logged_once_until_the_file_can_be_written(
+    part: Memories, log: web.Records, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hangs, full = "the disk has not answered for 5 s", "no space"
+    seen = [hangs, full, hangs, "the disk has not answered for 6 s", full, None, None, full, hangs]
+    for error in seen:
+        monkeypatch.setattr(FakeFile, "failing", error)
+        part.tick()
+    events = [(fields["event"], fields.get("error")) for fields in log.fields]
+    failing, back = "memory_file_failing", "memory_file_back"
+    expected = [(failing, hangs), (failing, full), (back, None), (failing, full), (failing, hangs)]
+    assert events == expected
+
+
+def test_a_stop_that_waits_for_a_failing_disk_says_so_without_a_write(
+    part: Memories, log: web.Records, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FakeFile, "failing", "the disk has not answered for 5 s")
+    part.close()
+    assert log.fields[-1]["event"] == "memory_file_storing"
 
 
 def test_a_mirror_is_kept_too(tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ the others.
 from __future__ import annotations
 
 import logging
+import re
+from collections import defaultdict
 from typing import TYPE_CHECKING, Any
 
 from holdfast import _core
@@ -33,7 +35,8 @@ class Memories(Part):
         self._seals = {name: memory.seal_changes for name, memory in memories.items()}
         self._files: dict[Path, _core.MemoryFile] = {}
         self._of_logs: dict[str, Path] = {}
-        self._failing: dict[Path, str | None] = {}
+        self._reasons: defaultdict[Path, set[str]] = defaultdict(set)
+        """Why a file can't be written, as logged since it last could. Reasons may alternate."""
         self._recreated: dict[Path, int] = {}
         self._only_copies: set[Path] = set()
         """Files that are written: what they lack is lost, unlike in those of logs."""
@@ -95,8 +98,10 @@ class Memories(Part):
 
     def _close(self, path: Path, file: _core.MemoryFile) -> None:
         """Stores pending writes."""
-        # A disk that hangs keeps the stop waiting.
-        if pending := file.status()["pending"]:
+        # A disk that hangs keeps the stop waiting, also without a write.
+        status = file.status()
+        pending = status["pending"]
+        if pending or status["failing"] is not None:
             log_lines.write(logging.INFO, "memory_file_storing", file=path, writes=pending)
         try:
             file.stop()
@@ -132,17 +137,20 @@ class Memories(Part):
         return {"memory_files": {str(path): dict(file.status()) for path, file in files}}
 
     def tick(self) -> None:
-        """Logs when a file can't be written any more, for each reason, and when it can again."""
+        """Logs why a file can't be written, once for each reason, and when it can again."""
         for path, file in self._files.items():
             self._log_recreated(path, file)
-            before, error = self._failing.get(path), file.status()["failing"]
-            self._failing[path] = error
-            if error == before:
+            logged, error = self._reasons[path], file.status()["failing"]
+            if error is None:
+                if logged:
+                    logged.clear()
+                    log_lines.write(logging.INFO, "memory_file_back", file=path)
                 continue
-            if error is not None:
+            # Numbers, such as that of a page, do not make another reason.
+            reason = re.sub(r"\d+", "", error)
+            if reason not in logged:
+                logged.add(reason)
                 log_lines.write(logging.ERROR, "memory_file_failing", file=path, error=error)
-            else:
-                log_lines.write(logging.INFO, "memory_file_back", file=path)
 
     def _log_recreated(self, path: Path, file: _core.MemoryFile) -> None:
         count = file.status()["recreated"]
