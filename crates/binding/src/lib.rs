@@ -6,6 +6,7 @@
 mod arguments;
 mod audit_fields;
 mod batch;
+mod batch_refused;
 mod channel;
 mod client;
 mod connection;
@@ -40,7 +41,9 @@ mod _core {
     use super::{Bound, PyModule, PyModuleMethods, PyResult, constants};
 
     #[pymodule_export]
-    use super::batch::{Batch, BatchRefused};
+    use super::batch::Batch;
+    #[pymodule_export]
+    use super::batch_refused::BatchRefused;
     #[pymodule_export]
     use super::channel::TlsChannel;
     #[pymodule_export]

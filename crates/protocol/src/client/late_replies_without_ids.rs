@@ -9,7 +9,6 @@ use core::time::Duration;
 
 use super::Time;
 use super::raised_timeouts::Lateness;
-use super::rtu_and_ascii::TURNAROUND;
 use super::tolerance::{AcceptUnit, Tolerance};
 use crate::pdu::{EncodedRequest, Request};
 
@@ -260,8 +259,7 @@ impl LateReplies {
                     .max(took * (LATENESS_FACTOR - 1))
                     .min(MAX_LATENESS)
             }
-            // However short its timeout is, no request is sent before.
-            Ended::Broadcast => sent + timeout.max(TURNAROUND),
+            Ended::Broadcast => sent + timeout,
             Ended::Damaged => (sent + timeout).min(now + usual.unwrap_or(WAIT_AFTER_DAMAGED_REPLY)),
         }
     }

@@ -203,8 +203,9 @@ impl OneAtATime {
             let broadcast = flights.first().filter(|flight| flight.unit_id == 0);
             self.state = match broadcast.filter(|_| self.silence.is_some()) {
                 Some(flight) => {
-                    // Units may confirm it from now on.
-                    let (request, times) = ((0, &flight.request), (now, self.timeout));
+                    // Units may confirm it from now on. No request is sent before the turnaround ends.
+                    let times = (now, self.timeout.max(TURNAROUND));
+                    let request = (0, &flight.request);
                     self.late_replies.ended(request, times, Ended::Broadcast, now);
                     State::Turnaround { until: now + TURNAROUND }
                 }

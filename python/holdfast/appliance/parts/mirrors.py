@@ -4,41 +4,23 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast import _core
 from holdfast.appliance.parts.device_leases import key_of
+from holdfast.appliance.parts.mirror_place import place_of
 from holdfast.appliance.parts.part import Part
 from holdfast.events import log_lines
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from holdfast.appliance.parts.mirror_place import Place
     from holdfast.appliance.parts.part import Plan
     from holdfast.config import Config
-    from holdfast.config.models.devices import DestinationConfig, StaleConfig
+    from holdfast.config.models.devices import StaleConfig
     from holdfast.types import Area
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where values of a device are in memory."""
-
-    memory: str
-    area: Area
-    address: int
-    count: int
-
-    @property
-    def range(self) -> tuple[Area, int, int]:
-        """The place in its memory."""
-        return self.area, self.address, self.count
-
-
-def place_of(into: DestinationConfig, count: int) -> Place:
-    """Where a read of that many items goes."""
-    return Place(into.memory, into.area, into.address, count)
 
 
 class Mirror(NamedTuple):

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast import _core
-from holdfast.appliance.parts.mirrors import place_of
+from holdfast.appliance.parts.mirror_place import place_of
 from holdfast.appliance.parts.native_links import endpoint_at
 from holdfast.config import read_plans
 from holdfast.polling.readings import Reader

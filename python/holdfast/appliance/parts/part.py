@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
 
     from holdfast._core import Memory, MirrorAge
-    from holdfast.appliance.parts.mirrors import Place
+    from holdfast.appliance.parts.mirror_place import Place
     from holdfast.config import Config
     from holdfast.types import ThreadHeartbeat
 
