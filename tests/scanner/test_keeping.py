@@ -16,6 +16,7 @@ from nats.js.kv import KeyValue
 
 from holdfast.scanner.jetstream import entries, store
 from holdfast.scanner.jetstream.store import BUCKET
+from holdfast.scanner.publish.publishers import Publishers
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import Caller, leaving, logged, subscription, tag
@@ -261,6 +262,32 @@ def test_what_is_not_a_subscription_or_no_longer_allowed_is_logged_and_left_alon
     ended = caller.request("modbus.unsubscribe", leaving("a", deviceId="gone"))
     assert ended == {"success": True}
     assert "modbus.subscription.hmi.gone.0" not in caller.keys(BUCKET)
+
+
+def test_a_refused_device_has_a_state_only_under_a_valid_name_of_its_own(
+    run_scanner: Run,
+    caller: Caller,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    published: list[str] = []
+    monkeypatch.setattr(
+        Publishers, "publish_given_up", lambda _self, device, _reason: published.append(device)
+    )
+    first = run_scanner()
+    request = subscription(server, tag("a", 0), deviceId="plc_1")
+    assert caller.request("modbus.subscribe", request)["success"]
+    first.stop()
+    refused = {"x\r\nPUB y 2\r\nhi": {}, "plc 1": {}, "gone": {"host": "192.0.2.1"}}
+    for number, (id, more) in enumerate(refused.items()):
+        text = json.dumps(request | {"deviceId": id} | more)
+        put(caller, f"modbus.subscription.hmi.refused{number}.0", text.encode())
+    run_scanner()
+    assert caller.request("modbus.browse", b"")["count"] == 1
+    wire.until(lambda: len(logged(caplog, "not_restored")) == len(refused), "all are refused")
+    assert caller.request("modbus.browse", b"")["count"] == 1
+    assert published == ["gone"]
 
 
 def test_a_tag_of_a_pending_subscription_can_be_left(

@@ -95,7 +95,9 @@ class Devices:
 
     def give_up(self, device_id: str, reason: str) -> None:
         """Publishes that a device is offline whose stored subscription is refused."""
-        if device_id not in self._registry.devices:  # Else another subscriber has it.
+        # A stored id may have characters that break the NATS protocol. The known device may be the
+        # same one, for another subscriber, or another one with the same name in subjects.
+        if device_id.isprintable() and not self._registry.has_subjects_of(device_id):
             self._publishers.publish_given_up(device_id, reason)
 
     def keep_only(self, device_id: str, subscriber_id: str, tags: Collection[str]) -> None:

@@ -221,6 +221,11 @@ class Registry:
             return device, True
         return device, bool(forgotten) or device.rate != before
 
+    def has_subjects_of(self, device_id: str) -> bool:
+        """Returns whether a known device has a name in subjects that this one would have."""
+        names = {subject_id(device_id), *self._dialect.device_names(device_id)}
+        return not names.isdisjoint(self._subjects)
+
     def commanded(self, name: str) -> tuple[ScannedDevice, Tag]:
         """Returns the tag of a command's name: an id, or device and id. Raises `Refused`."""
         matches = {
