@@ -290,6 +290,19 @@ def test_a_refused_device_has_a_state_only_under_a_valid_name_of_its_own(
     assert published == ["gone"]
 
 
+def test_a_kept_description_that_is_too_long_is_cut(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    request = subscription(server, tag("a", 0, description="ä" * 5000), tag("b", 1))
+    first = run_scanner()
+    assert caller.request("modbus.subscribe", subscription(server, tag("b", 1)))["success"]
+    first.stop()
+    put(caller, "modbus.subscription.hmi.plc1.0", json.dumps(request).encode())
+    run_scanner()
+    found = {each["id"]: each.get("description") for each in device(caller, "plc1")["tags"]}
+    assert found == {"a": "ä" * 4096, "b": None}
+
+
 def test_a_tag_of_a_pending_subscription_can_be_left(
     run_scanner: Run, caller: Caller, server: holdfast.Server
 ) -> None:

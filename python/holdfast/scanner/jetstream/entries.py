@@ -5,11 +5,13 @@ from __future__ import annotations
 import base64
 import math
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from holdfast.client.url import NetworkTarget
+from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.decoding import decode
 from holdfast.scanner.messages.subject_parts import subject_id
 from holdfast.scanner.messages.types import MAX_DESCRIPTION, SubscribeRequest, TagRequest
@@ -96,8 +98,25 @@ def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
 
 
 def restored(value: bytes) -> SubscribeRequest:
-    """Parses a stored request. Raises `Refused`."""
-    return decode(value, SubscribeRequest, MAX_ENTRY_BYTES)
+    """Returns a stored request. Raises `Refused`."""
+    try:
+        return decode(value, SubscribeRequest, MAX_ENTRY_BYTES)
+    except Refused:
+        # It may be older than the limit of descriptions. A description ends no subscription.
+        return decode(_with_cut_descriptions(value), SubscribeRequest, MAX_ENTRY_BYTES)
+
+
+def _with_cut_descriptions(value: bytes) -> bytes:
+    """Returns a stored request with descriptions of a valid length; other values as they are."""
+    try:
+        found = msgspec.json.decode(value, type=dict[str, Any])
+        tags = msgspec.convert(found.get("tags"), list[dict[str, Any]])
+    except MALFORMED_JSON:
+        return value
+    for tag in tags:
+        if type(text := tag.get("description")) is str:
+            tag["description"] = text[:MAX_DESCRIPTION]
+    return _encode(found | {"tags": tags})
 
 
 def without(found: Iterable[SubscribeRequest], ids: Collection[str]) -> list[SubscribeRequest]:
