@@ -22,6 +22,7 @@ from holdfast.scanner.fleet.agreement import FleetRefused
 from holdfast.scanner.service import Scanner
 from holdfast.scanner.settings import FleetSettings, Settings
 from holdfast.scanner.subscriptions.key import SubscriptionKey
+from holdfast.tags import Tag, TagList
 from support import wire
 from support.cli import invoke
 from support.fleet_nodes import FLEET, prepare
@@ -64,10 +65,13 @@ def node(own_nats: NatsServer, run_scanner: Run) -> Callable[..., Running]:
     prepare(own_nats.url, PARTITIONS)
 
     def start(
-        name: str, lease_times: LeaseTimes = LEASE_TIMES, check_interval_s: float = 5.0
+        name: str,
+        lease_times: LeaseTimes = LEASE_TIMES,
+        check_interval_s: float = 5.0,
+        **more: Any,
     ) -> Running:
         fleet = FleetSettings(FLEET, name, PARTITIONS, lease_times, check_interval_s)
-        return run_scanner(own_nats, fleet=fleet)
+        return run_scanner(own_nats, fleet=fleet, **more)
 
     return start
 
@@ -588,6 +592,46 @@ def test_a_renewal_at_another_node_causes_no_scan(
     wire.until(lambda: times._ends[key] > before, "it is renewed")
     # An extra scan begins with another name in the poller.
     assert (device.polled_as, device in polling._pending_changes) == (polled_as, False)
+
+
+def test_a_profile_with_more_tags_than_are_stored_causes_one_scan(
+    node: Callable[..., Running],
+    caller: Caller,
+    judges: Judges,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    profile = TagList([Tag(id, "holding_registers", at) for at, id in enumerate("xyz")])
+    running = node("a", profiles={"meter": profile})
+    share(running)
+    [judge, *_] = judges.devices
+    request = wanted(judge, tags=[], profile="meter", scanRate=60_000)
+    assert caller.request("modbus.subscribe", request)["success"]
+    device, member = devices_of(running)["d0"], member_of(running.scanner)
+    scanned: list[ScannedDevice] = []
+    monkeypatch.setattr(
+        polling_of(running.scanner), "renew", lambda device, **_more: scanned.append(device)
+    )
+
+    def scans_by(value: dict[str, Any]) -> int:
+        """Stores a value as another node would, and returns how many scans that causes."""
+        before = member._applied["d0"]
+        scanned.clear()
+        caller.put(WANTS, D0, value)
+        wire.until(lambda: member._applied["d0"] > before, "it is adopted")
+        return len(scanned)
+
+    value = json.loads(caller.text(WANTS, D0))
+    [stored] = value["requests"]
+    stored["tags"].reverse()
+    assert scans_by(value) == 0
+    del stored["tags"][0]
+    assert [scans_by(value), scans_by(value)] == [1, 0]
+    assert set(device.tags) == {*"xyz"}
+    # What ends at another node ends here, too.
+    del stored["profile"]
+    scans_by(value)
+    assert set(device.tags) == {*"xy"}
+    assert device.subscribers["hmi"].profile is None
 
 
 def test_a_device_that_no_node_reports_is_not_online(

@@ -236,6 +236,63 @@ def test_a_pending_subscription_that_leaves_a_tag_of_its_profile_has_not_all_of_
     [profile_left] = entries.without([request], {"a"})
     assert (profile_left.profile, profile_left.tags) == (None, tags[1:])
     assert entries.without([request], {"a", "b"}) == []
+    parts = [SubscribeRequest("plc1", "hmi", [each], profile="p") for each in tags]
+    [second_left] = entries.without(parts, {"a"})
+    assert (second_left.profile, second_left.tags) == (None, tags[1:])
+
+
+@pytest.mark.parametrize("part_bytes", [1, entries.MAX_PART_BYTES])
+@pytest.mark.parametrize("keeps", [True, False])
+def test_a_tag_that_a_profile_gains_ends_no_subscription(
+    caller: Caller,
+    server: holdfast.Server,
+    run_scanner: Run,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    part_bytes: int,
+    keeps: bool,
+) -> None:
+    monkeypatch.setattr(entries, "MAX_PART_BYTES", part_bytes)
+    now = TagList([*PROFILE, Tag("level", "holding_registers", 8, "int16")])
+
+    def running(profile: TagList, before: Running | None = None) -> Running:
+        if before is not None:
+            before.stop()
+        former = () if before is None or keeps else tuple(before.scanner.stored_requests())
+        return run_scanner(
+            former=former,
+            prefix="line2",
+            profiles={"heater": profile},
+            writes="explicit",
+            keep_subscriptions=keeps,
+        )
+
+    def tags() -> dict[str, dict[str, Any]]:
+        [found] = caller.request("line2.browse", b"")["devices"]
+        return {tag["id"]: tag for tag in found["tags"]}
+
+    open_ = tag("open", 3, "boolean", functionCode="coil")
+    first = running(PROFILE)
+    for request in (
+        subscription(server, tag("own", 9), open_, profile="heater"),
+        subscription(server, tag("level", 7), open_, subscriberId="log"),
+    ):
+        assert caller.request("line2.subscribe", request)["success"]
+    before = tags()
+    second = running(now, first)
+    assert tags() == before
+    [left] = logged(caplog, "tags_not_restored")
+    assert (left["device"], left["subscriber"], left["tags"]) == ("plc1", "hmi", "level")
+    assert left["reason"].startswith("tag 'level' of plc1 already has another definition")
+    assert not logged(caplog, "not_restored")
+    # It has the tag when the cause of the refusal is gone.
+    assert caller.request("line2.unsubscribe", leaving("level", subscriberId="log"))["success"]
+    third = running(now, second)
+    gained = tags()
+    assert gained.pop("level")["profile"] == "heater"
+    del before["level"]
+    assert gained == before
+    third.stop()
 
 
 def test_a_scale_in_a_register_is_that_of_the_same_scan(

@@ -28,13 +28,14 @@ from support import wire
 from support.brokers import NatsServer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterator
+    from collections.abc import Callable, Coroutine, Iterable, Iterator
     from types import TracebackType
     from typing import Self
 
     from nats.aio.msg import Msg
 
     import holdfast
+    from holdfast.scanner.messages.types import SubscribeRequest
 
 Result = TypeVar("Result")
 
@@ -236,19 +237,19 @@ def _bytes(payload: object) -> bytes:
 class Running:
     """A scanner in its own thread."""
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, former: Iterable[SubscribeRequest] = ()) -> None:
         loop = _Loop()
         self._loop: _Loop | None = loop
         try:
-            self.scanner = loop.do(self._made(settings))
+            self.scanner = loop.do(self._made(settings, former))
         except BaseException:
             loop.close()
             raise
         self.ended = asyncio.run_coroutine_threadsafe(self.scanner.run(), loop.loop)
 
     @staticmethod
-    async def _made(settings: Settings) -> Scanner:
-        return Scanner(settings)
+    async def _made(settings: Settings, former: Iterable[SubscribeRequest]) -> Scanner:
+        return Scanner(settings, former=former)
 
     @property
     def serves(self) -> bool:
@@ -326,7 +327,8 @@ def run_scanner(nats: NatsServer) -> Iterator[Run]:
             more.setdefault("servers", Servers(((server or nats).url,)))
             more.setdefault("max_pause_s", 0.1)
             more["allow"] = tuple(map(parse_pollable, more.get("allow", ())))
-            scanner = Running(Settings(**more))
+            former = more.pop("former", ())
+            scanner = Running(Settings(**more), former)
             running.callback(scanner.stop)
             if wait:
                 wire.until(lambda: scanner.serves, "the scanner is connected")

@@ -7,19 +7,21 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from holdfast.events import log_lines
 from holdfast.runtime.text import clip
 from holdfast.scanner.errors import Refused
+from holdfast.scanner.jetstream.entries import joined, restored, without
 from holdfast.scanner.jetstream.entries import requests as stored_requests
-from holdfast.scanner.jetstream.entries import restored, without
 from holdfast.scanner.jetstream.entry_subscriptions import check_entry
 from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
 from holdfast.scanner.messages.types import Answer, SubscribeRequest, UnsubscribeRequest
 from holdfast.scanner.subscriptions.key import SubscriptionKey
-from holdfast.scanner.subscriptions.subscription import subscription_of, without_lost
+from holdfast.scanner.subscriptions.subscription import gained, subscription_of, without_lost
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from nats.aio.msg import Msg
 
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.placement import Placement
     from holdfast.scanner.polling.devices import Devices
     from holdfast.scanner.responder import Responder
+    from holdfast.scanner.subscriptions.device import Subscriber
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.request_rules import Rules
     from holdfast.scanner.subscriptions.subscription import Subscription
@@ -80,6 +83,19 @@ class RequestLog:
             subscriber=subscription.subscriber,
             tags=len(subscription.tags),
             scan_rate=subscription.rate,
+        )
+
+    def tags_not_restored(
+        self, subscription: Subscription, tags: Iterable[str], reason: str
+    ) -> None:
+        """Logs the tags without which a stored subscription is carried out."""
+        log_lines.write(
+            logging.WARNING,
+            "tags_not_restored",
+            device=subscription.device,
+            subscriber=subscription.subscriber,
+            tags=clip(", ".join(tags), MAX_LOGGED_IDS),
+            reason=reason,
         )
 
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
@@ -227,34 +243,36 @@ class Requests:
         """Carries out a stored request, unless an entry has replaced it. Raises `Refused`."""
         if self.is_entry(request.device_id, request.subscriber_id):
             return
-        adjustments = Adjustments()
-        subscription = self._stored_subscription(request, adjustments)
-        async with self._devices.lock(subscription.device):
-            await self._devices.add(subscription, is_stored=True)
-        self._log.byte_orders(subscription, adjustments, subscription.tags)
+        async with self._devices.lock(request.device_id):
+            await self._add_stored(request, is_stored=True)
 
-    def _stored_subscription(
-        self, request: SubscribeRequest, adjustments: Adjustments | None = None
+    async def _add_stored(
+        self, request: SubscribeRequest, *, is_stored: bool = False, renewed: bool = True
     ) -> Subscription:
-        """Returns the subscription of a stored request, with the tags that profiles have now.
+        """Adds the subscription of a stored request, with the tags that profiles have now.
 
-        Raises `Refused`.
+        Without tags that a profile has gained, if they are refused. Raises `Refused`.
         """
         left, lost = without_lost(request, self._rules)
-        device = self._registry.devices.get(request.device_id)
-        is_known = device is not None and request.subscriber_id in device.subscribers
-        if not (left.tags or left.profile or is_known):
+        if not (left.tags or left.profile):
             left, lost = request, []  # Refused, and so kept: the tags may return.
-        subscription = subscription_of(left, self._rules, adjustments)
+        more = gained(left, self._rules)
+        adjustments = Adjustments()
+        try:
+            subscription = subscription_of(left, self._rules, adjustments)
+            await self._devices.add(subscription, is_stored=is_stored, renewed=renewed)
+        except Refused as refused:
+            if not (more and left.tags):
+                raise
+            adjustments = Adjustments()
+            subscription = subscription_of(left, self._rules, adjustments, expands=False)
+            await self._devices.add(subscription, is_stored=is_stored, renewed=renewed)
+            self._log.tags_not_restored(subscription, more, str(refused))
         if lost:
-            log_lines.write(
-                logging.WARNING,
-                "tags_not_restored",
-                device=request.device_id,
-                subscriber=request.subscriber_id,
-                tags=clip(", ".join(lost), MAX_LOGGED_IDS),
-                reason="their profile does not have them any more",
-            )
+            reason = "their profile does not have them any more"
+            self._log.tags_not_restored(subscription, lost, reason)
+        if is_stored:  # In a fleet, the node that has received the request has logged it.
+            self._log.byte_orders(subscription, adjustments, subscription.tags)
         return subscription
 
     async def adopt(
@@ -289,23 +307,35 @@ class Requests:
         desired: Mapping[str, Sequence[SubscribeRequest]],
         renewed: Collection[str],
     ) -> None:
-        for subscriber, requests in desired.items():
-            if list(requests) == self._carried_out(device, subscriber):
+        whole = map(joined, desired.values())
+        # Those with a profile last: a tag that it has gained must not displace one of another.
+        for request in sorted(whole, key=lambda each: each.profile is not None):
+            subscriber, wanted = request.subscriber_id, _sorted(request)
+            present, known = self._carried_out(device, subscriber)
+            if known is not None and (wanted == present or (wanted, present) == known.adopted):
                 # Adding it again would make the device be scanned, and its values be published.
                 if subscriber in renewed:
-                    self._devices.ttls.renew(device, subscriber, requests[0].ttl)
+                    self._devices.ttls.renew(device, subscriber, request.ttl)
                 continue
-            tags: set[str] = set()
-            for request in requests:
-                subscription = self._stored_subscription(request)
-                # A large subscription is stored as several requests.
-                await self._devices.add(subscription, renewed=subscriber in renewed)
-                tags |= subscription.tags.keys()
-            self._devices.keep_only(device, subscriber, tags)
+            if known is not None:
+                known.profile = request.profile  # It may have ended at another node.
+            subscription = await self._add_stored(request, renewed=subscriber in renewed)
+            self._devices.keep_only(device, subscriber, subscription.tags)
+            present, known = self._carried_out(device, subscriber)
+            if known is not None:
+                known.adopted = None if present is None or present == wanted else (wanted, present)
 
-    def _carried_out(self, device: str, subscriber: str) -> list[SubscribeRequest]:
-        """Returns the requests that make a subscription as it is known here."""
-        known = self._registry.devices.get(device)
-        if known is None or subscriber not in known.subscribers:
-            return []
-        return list(map(restored, stored_requests(known, subscriber)))
+    def _carried_out(
+        self, device_id: str, subscriber_id: str
+    ) -> tuple[SubscribeRequest | None, Subscriber | None]:
+        """Returns the request that makes a subscription as it is known here, and its subscriber."""
+        device = self._registry.devices.get(device_id)
+        known = None if device is None else device.subscribers.get(subscriber_id)
+        if device is None or known is None:
+            return None, None
+        return _sorted(joined([*map(restored, stored_requests(device, subscriber_id))])), known
+
+
+def _sorted(request: SubscribeRequest) -> SubscribeRequest:
+    """Returns a request in a form to compare: nodes of a fleet may have its tags in any order."""
+    return msgspec.structs.replace(request, tags=sorted(request.tags, key=lambda tag: tag.id))

@@ -17,7 +17,7 @@ from holdfast.scanner.dialects import DIALECTS, Dialect
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.fleet.placement import FleetPlacement
 from holdfast.scanner.jetstream.buckets import Buckets, TentacleNextBuckets
-from holdfast.scanner.jetstream.entries import requests, restored
+from holdfast.scanner.jetstream.entries import joined, requests, restored
 from holdfast.scanner.jetstream.restore import StoredSubscriptions
 from holdfast.scanner.placement import Placement
 from holdfast.scanner.polling import device_tls
@@ -173,8 +173,15 @@ class Scanner:
 
     async def _restore_former(self) -> None:
         former, self.former = self.former, ()
-        if self._settings.fleet is None:  # A fleet has stored all of them.
-            await asyncio.gather(*map(self._restore, former))
+        if self._settings.fleet is not None:
+            return  # A fleet has stored all of them.
+        parts: dict[SubscriptionKey, list[SubscribeRequest]] = {}
+        for request in former:
+            owner = SubscriptionKey(request.device_id, request.subscriber_id)
+            parts.setdefault(owner, []).append(request)
+        # Those with a profile last: a tag that it has gained must not displace one of another.
+        requests = sorted(map(joined, parts.values()), key=lambda each: each.profile is not None)
+        await asyncio.gather(*map(self._restore, requests))
 
     async def _restore(self, request: SubscribeRequest) -> None:
         about = {"device": request.device_id, "subscriber": request.subscriber_id}

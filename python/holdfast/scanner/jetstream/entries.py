@@ -19,7 +19,7 @@ from holdfast.scanner.subscriptions.device import NO_OPTIONS, TagOptions
 from holdfast.scanner.subscriptions.tag import CODE_OF_AREA
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from holdfast.scanner.messages.types import Marker
     from holdfast.scanner.subscriptions.device import ScannedDevice
@@ -64,7 +64,7 @@ def _token(text: str) -> str:
 def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
     """Yields the requests that make the subscription of a subscriber, each of limited size.
 
-    The first one has the profile, if there is one: it adds the tags that the profile has gained.
+    Each has the profile, if there is one: it adds the tags that the profile has gained.
     """
     known = device.subscribers[subscriber]
     head = {
@@ -79,18 +79,16 @@ def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
         "deadband": known.deadband if known.publish == "change" else None,
         "plan": device.source.plan.request,
         "ttl": known.ttl,
+        "profile": known.profile,
     }
-    rest = _encode({key: value for key, value in head.items() if value is not None})[:-1]
-    before = rest
-    if known.profile is not None:
-        before += b',"profile":' + _encode(known.profile)
+    before = _encode({key: value for key, value in head.items() if value is not None})[:-1]
     part: list[bytes] = []
     size = 0
     for id, options in known.tags.items():
         text = _tag(device.tags[id], options, known.profile)
         if part and size + len(text) > MAX_PART_BYTES:
             yield before + b',"tags":[' + b",".join(part) + b"]}"
-            before, part, size = rest, [], 0
+            part, size = [], 0
         part.append(text)
         size += len(text)
     if part:
@@ -121,14 +119,26 @@ def _with_cut_descriptions(value: bytes) -> bytes:
 
 def without(found: Iterable[SubscribeRequest], ids: Collection[str]) -> list[SubscribeRequest]:
     """Returns the requests without the tags with these ids, if they have tags left."""
-    requests = []
-    for each in found:
-        left = [tag for tag in each.tags if tag.id not in ids]
-        is_whole = all(tag.profile != each.profile or tag.id not in ids for tag in each.tags)
-        profile = each.profile if is_whole else None
-        if left:
-            requests.append(msgspec.structs.replace(each, tags=left, profile=profile))
-    return requests
+    parts = list(found)
+    profile = next((each.profile for each in parts if each.profile is not None), None)
+    if any(tag.profile == profile and tag.id in ids for each in parts for tag in each.tags):
+        profile = None  # The subscriber has not all of its tags any more.
+    left = (
+        msgspec.structs.replace(
+            each, tags=[tag for tag in each.tags if tag.id not in ids], profile=profile
+        )
+        for each in parts
+    )
+    return [each for each in left if each.tags]
+
+
+def joined(parts: Sequence[SubscribeRequest]) -> SubscribeRequest:
+    """Returns the stored requests of a subscription as one.
+
+    A profile is expanded for the whole subscription: a tag that it has may be in any of them.
+    """
+    tags = {tag.id: tag for each in parts for tag in each.tags}
+    return msgspec.structs.replace(parts[0], tags=list(tags.values()))
 
 
 def _place(device: ScannedDevice) -> dict[str, object]:

@@ -14,6 +14,7 @@ from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.availability import MAX_RETRY_S
 from holdfast.scanner.jetstream.entries import (
+    joined,
     number,
     numbered,
     requests,
@@ -183,20 +184,20 @@ class StoredSubscriptions(Placement):
         await asyncio.gather(*(self._restore_device(host, each) for each in devices.values()))
 
     async def _restore_device(self, host: SubscriptionHost, owners: list[SubscriptionKey]) -> None:
-        for owner in owners:
-            found = self._pending.get(owner, [])
+        pending = [(owner, self._pending.get(owner, [])) for owner in owners]
+        # Those with a profile last: a tag that it has gained must not displace one of another.
+        for owner, found in sorted(pending, key=lambda each: any(part.profile for part in each[1])):
+            if not found or self._pending.get(owner) is not found:
+                continue  # A caller has changed it.
             try:
-                for request in found:
-                    if self._pending.get(owner) is not found:
-                        break  # A caller has changed it.
-                    await host.restore(request)
+                await host.restore(joined(found))
             except Refused as refused:
                 if owner not in self._logged:
                     self._logged.add(owner)
                     self._log(logging.WARNING, "not_restored", owner, reason=str(refused))
                     self._device_host.give_up(owner.device, str(refused))
                 continue
-            if found and self._pending.get(owner) is found:
+            if self._pending.get(owner) is found:
                 self._touch(owner)
                 tags = sum(len(request.tags) for request in found)
                 self._log(logging.INFO, "restored", owner, tags=tags)

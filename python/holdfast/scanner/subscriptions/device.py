@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from holdfast._core import Endpoint
     from holdfast.client.url import Target
     from holdfast.config.values.scanner_settings import Publish, Writes
+    from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.subscriptions.health import Health
     from holdfast.scanner.subscriptions.plan import Plan
     from holdfast.scanner.subscriptions.tag import Tag
@@ -50,7 +51,9 @@ class Subscriber:
     ttl: int | None = None
     """Seconds after which the subscription ends, unless a request renews it."""
     profile: str | None = None
-    """The profile whose tags it has, all of them."""
+    """The profile whose tags it has: all of them, unless a tag that it gained was refused."""
+    adopted: tuple[SubscribeRequest, SubscribeRequest] | None = None
+    """What it was adopted from in a fleet, and what that has become with the present profile."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,13 +58,20 @@ class Subscription:
     ttl: int | None
     """Seconds."""
     profile: str | None
-    """The profile whose tags are among `tags`, all of them."""
+    """The profile whose tags are among `tags`: all of them, unless it was not expanded."""
 
 
 def subscription_of(
-    request: SubscribeRequest, rules: Rules, adjustments: Adjustments | None = None
+    request: SubscribeRequest,
+    rules: Rules,
+    adjustments: Adjustments | None = None,
+    *,
+    expands: bool = True,
 ) -> Subscription:
-    """Checks a request alone. Adds to `adjustments` what is adjusted. Raises `Refused`."""
+    """Checks a request alone. Adds to `adjustments` what is adjusted. Raises `Refused`.
+
+    Unless it `expands` the profile of the request, only the tags of the request are subscribed to.
+    """
     adjustments = Adjustments() if adjustments is None else adjustments
     defaults = rules.defaults
     _check_id(request.device_id)
@@ -85,7 +92,7 @@ def subscription_of(
     target = source.target
     if source.unit == 0 and (isinstance(target, SerialTarget) or target.transport in SERIAL_FRAMES):
         raise Refused("unitId is 0, which is the broadcast of a serial line")
-    tags, options = requested_tags(request, rules, adjustments)
+    tags, options = requested_tags(request, rules, adjustments, expands=expands)
     source.plan.check(list(tags.values()))
     return Subscription(
         request.device_id,
@@ -141,14 +148,15 @@ NO_MARKERS: frozenset[Marker] = frozenset()
 
 
 def requested_tags(
-    request: SubscribeRequest, rules: Rules, adjustments: Adjustments
+    request: SubscribeRequest, rules: Rules, adjustments: Adjustments, *, expands: bool = True
 ) -> tuple[dict[str, Tag], dict[str, TagOptions]]:
     """Returns the tags of a request by id, and what it sets for each. Raises `Refused`.
 
     A tag of the request replaces that of its profile.
     """
     order = ORDERS.get(request.byte_order or "big", request.byte_order or "")
-    of_profile = [] if request.profile is None else _profile_requests(request.profile, rules)
+    profile = request.profile if expands else None
+    of_profile = [] if profile is None else _profile_requests(profile, rules)
     replaceable = {entry.id for entry in of_profile}
     entries = [(f"profile {request.profile}", entry) for entry in of_profile]
     entries += ((f"tags[{index}]", entry) for index, entry in enumerate(request.tags))
@@ -179,6 +187,13 @@ def without_lost(request: SubscribeRequest, rules: Rules) -> tuple[SubscribeRequ
         else:
             lost.append(tag.id)
     return msgspec.structs.replace(request, tags=left), lost
+
+
+def gained(request: SubscribeRequest, rules: Rules) -> list[str]:
+    """Returns the ids of the tags that the profile of a stored request has, and it has not."""
+    profile = None if request.profile is None else rules.profiles.get(request.profile)
+    stored = {tag.id for tag in request.tags}
+    return [] if profile is None else [tag.name for tag in profile if tag.name not in stored]
 
 
 def _options(entry: TagRequest) -> TagOptions:
