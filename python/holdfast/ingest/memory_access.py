@@ -7,7 +7,6 @@ Accesses are counted, and writes are audited.
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import logging
 import threading
@@ -39,6 +38,7 @@ from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
+    import asyncio
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from holdfast._core import Follower, Memory, Passage
@@ -181,6 +181,8 @@ class MemoryAccess:
         Writes are carried out in the order in which they came, and also if nobody waits any more.
         Returns `None` if a device must take the write.
         """
+        import asyncio  # An appliance without REST has no event loop.
+
         assert begun.writes is not None
         loop = asyncio.get_running_loop()
         ended: asyncio.Future[_Outcome] = loop.create_future()

@@ -52,7 +52,7 @@ class Claim:
     memory: str
     area: Area
     addresses: range
-    source: tuple[KeyPath, Area, int] | None = None
+    source: tuple[str, Area, int] | None = None
 
     def __str__(self) -> str:
         return f"{self.area} {extent(self.addresses)} of {self.memory}"
@@ -64,7 +64,8 @@ def check_devices(scope: Scope) -> None:
         claims: list[Claim] = []
         for path, device in items(("devices",), scope.config.devices):
             _Device(scope, path, device, claims).check()
-        _check_overlaps(scope, claims)
+        for path, message in _overlaps(scope, claims):
+            scope.report.add(path, f"{message}, allowed: addresses without overlap")
 
 
 @dataclass
@@ -111,8 +112,6 @@ class _Device:
                 self._target((*path, "status"), status, forward.format)
                 self._forwarded_status((*path, "status"), forward, status)
         with until_invalid():
-            self._forwarded_reads(forward)
-        with until_invalid():
             for area in forward.offsets.model_fields_set:
                 self._offset((*path, "offsets", area), area, getattr(forward.offsets, area))
 
@@ -132,19 +131,6 @@ class _Device:
         memory = _memory_of(forward, status)
         if memory is not None:
             self.claims.append(Claim(path, memory, status.area, status.addresses))
-
-    def _forwarded_reads(self, forward: ForwardConfig) -> None:
-        """Each address of a receiver has one source."""
-        memory = _memory_of(forward, forward)
-        if memory is None:
-            return
-        for path, read in items((*self.path, "reads"), self.device.reads):
-            with until_invalid():
-                at = read.into or read
-                first = at.address + getattr(forward.offsets, at.area)
-                addresses = range(first, first + read.count)
-                source = (self.path, read.area, first - read.address)
-                self.claims.append(Claim(path, memory, at.area, addresses, source))
 
     def _offset(self, path: KeyPath, area: str, offset: int) -> None:
         """With its offset, every read is within the area of the receiver."""
@@ -230,8 +216,23 @@ def _memory_of(forward: ForwardConfig, named: ForwardConfig | ForwardedStatusCon
     return f"{_NAMING[forward.format]} {target} of {joined(receiver.host, receiver.port)}"
 
 
-def _check_overlaps(scope: Scope, claims: list[Claim]) -> None:
-    """Reports reads and blocks that write an address twice, at the later one in the file."""
+def _forwarded_reads(config: Config) -> Iterator[Claim]:
+    for name, device in config.devices.items():
+        for forward in device.forward:
+            for index, read in enumerate(device.reads):
+                at = read.into or read
+                first = at.address + getattr(forward.offsets, at.area)
+                yield Claim(
+                    ("devices", name, "reads", index),
+                    _memory_of(forward, forward) or "",
+                    at.area,
+                    range(first, first + read.count),
+                    (name, read.area, first - read.address),
+                )
+
+
+def _overlaps(scope: Scope, claims: list[Claim]) -> Iterator[tuple[KeyPath, str]]:
+    """Reads and blocks that write an address twice: the later one in the file, and a message."""
     order = {id(claim): number for number, claim in enumerate(claims)}
     widest: dict[tuple[str, str], Claim] = {}
     for claim in sorted(claims, key=lambda claim: claim.addresses.start):
@@ -241,8 +242,7 @@ def _check_overlaps(scope: Scope, claims: list[Claim]) -> None:
         if not is_same and claim.addresses.start < before.addresses.stop:
             first, second = sorted((before, claim), key=lambda each: order[id(each)])
             overlapped = f"{extent(first.addresses)} of {scope.report.named(first.path)}"
-            message = f"found {second}, which overlaps {overlapped}"
-            scope.report.add(second.path, f"{message}, allowed: addresses without overlap")
+            yield second.path, f"found {second}, which overlaps {overlapped}"
         if claim.addresses.stop > before.addresses.stop:
             widest[key] = claim
 
@@ -252,7 +252,10 @@ def _meet(one: range, other: range) -> bool:
 
 
 def warn_of_devices(scope: Scope) -> None:
-    """Warns about settings of valid devices that have no effect."""
+    """Warns about settings of valid devices that have no effect, or undo each other."""
+    # Programs that Holdfast replaces accept this: each poll overwrites the values of the other.
+    for where, message in _overlaps(scope, list(_forwarded_reads(scope.config))):
+        scope.report.warn(where, f"{message}: the values overwrite each other at the receiver")
     for path, device in scope.config.devices.items():
         for where, message in _warnings(scope, ("devices", path), device):
             scope.report.warn(where, message)
