@@ -10,7 +10,7 @@ use pyo3::pybacked::PyBackedBytes;
 use pyo3::types::{PyBytes, PyList, PyString, PyTuple};
 
 use crate::audit_fields;
-use crate::batch_refused::{refusal, refused};
+use crate::batch_refusal::{refusal, refused};
 use crate::ended_writes::Waiting;
 use crate::memory::{Memory, Unfit, integer, is_text, item, put};
 

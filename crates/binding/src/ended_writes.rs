@@ -10,7 +10,7 @@ use std::sync::mpsc::{SendError, Sender, channel};
 use holdfast_memory::{Outcome, Refusal, Refused};
 use pyo3::prelude::*;
 
-use crate::batch_refused::refused;
+use crate::batch_refusal::refused;
 
 /// A function of Python that waits for the outcome of a write, and the number of its values.
 pub struct Waiting(Option<(Py<PyAny>, usize)>);

@@ -6,7 +6,7 @@
 mod arguments;
 mod audit_fields;
 mod batch;
-mod batch_refused;
+mod batch_refusal;
 mod channel;
 mod client;
 mod connection;
@@ -43,7 +43,7 @@ mod _core {
     #[pymodule_export]
     use super::batch::Batch;
     #[pymodule_export]
-    use super::batch_refused::BatchRefused;
+    use super::batch_refusal::BatchRefused;
     #[pymodule_export]
     use super::channel::TlsChannel;
     #[pymodule_export]

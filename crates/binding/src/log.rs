@@ -15,7 +15,7 @@ use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyDict, PyList};
 
 use crate::arguments::{seconds, within, word};
-use crate::batch_refused::reason;
+use crate::batch_refusal::reason;
 use crate::memory::Memory;
 use crate::python_values::listed;
 

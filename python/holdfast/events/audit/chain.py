@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import msgspec
 
-from holdfast.events.audit.escaping import escaped
+from holdfast.events.audit.escapes import escaped
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -3,7 +3,7 @@
 //!
 //! A request that can be answered here waits until all before it are answered: its client expects the
 //! effects of those. All behind it wait too. The connection is read meanwhile: its end, a repetition or a newer
-//! request decides what becomes of those that wait.
+//! request may mean that those that wait are not sent.
 //!
 //! Without transaction ids, a client that sends another request after a pause has given up: no reply to an
 //! earlier one may come then.
