@@ -12,7 +12,7 @@ import msgspec
 from holdfast.events import log_lines
 from holdfast.runtime.text import clip
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.jetstream.entries import joined, restored, without
+from holdfast.scanner.jetstream.entries import is_last, joined, restored, without
 from holdfast.scanner.jetstream.entries import requests as stored_requests
 from holdfast.scanner.jetstream.entry_subscriptions import check_entry
 from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
@@ -307,9 +307,7 @@ class Requests:
         desired: Mapping[str, Sequence[SubscribeRequest]],
         renewed: Collection[str],
     ) -> None:
-        whole = map(joined, desired.values())
-        # Those with a profile last: a tag that it has gained must not displace one of another.
-        for request in sorted(whole, key=lambda each: each.profile is not None):
+        for request in map(joined, sorted(desired.values(), key=is_last)):
             subscriber, wanted = request.subscriber_id, _sorted(request)
             present, known = self._carried_out(device, subscriber)
             if known is not None and (wanted == present or (wanted, present) == known.adopted):

@@ -17,7 +17,7 @@ from holdfast.scanner.dialects import DIALECTS, Dialect
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.fleet.placement import FleetPlacement
 from holdfast.scanner.jetstream.buckets import Buckets, TentacleNextBuckets
-from holdfast.scanner.jetstream.entries import joined, requests, restored
+from holdfast.scanner.jetstream.entries import is_last, joined, requests, restored
 from holdfast.scanner.jetstream.restore import StoredSubscriptions
 from holdfast.scanner.placement import Placement
 from holdfast.scanner.polling import device_tls
@@ -179,9 +179,8 @@ class Scanner:
         for request in former:
             owner = SubscriptionKey(request.device_id, request.subscriber_id)
             parts.setdefault(owner, []).append(request)
-        # Those with a profile last: a tag that it has gained must not displace one of another.
-        requests = sorted(map(joined, parts.values()), key=lambda each: each.profile is not None)
-        await asyncio.gather(*map(self._restore, requests))
+        former = map(joined, sorted(parts.values(), key=is_last))
+        await asyncio.gather(*map(self._restore, former))
 
     async def _restore(self, request: SubscribeRequest) -> None:
         about = {"device": request.device_id, "subscriber": request.subscriber_id}

@@ -219,12 +219,14 @@ def _memory_of(forward: ForwardConfig, named: ForwardConfig | ForwardedStatusCon
 def _forwarded_reads(config: Config) -> Iterator[Claim]:
     for name, device in config.devices.items():
         for forward in device.forward:
+            memory = _memory_of(forward, forward)
+            assert memory is not None, "a valid configuration has one"
             for index, read in enumerate(device.reads):
                 at = read.into or read
                 first = at.address + getattr(forward.offsets, at.area)
                 yield Claim(
                     ("devices", name, "reads", index),
-                    _memory_of(forward, forward) or "",
+                    memory,
                     at.area,
                     range(first, first + read.count),
                     (name, read.area, first - read.address),

@@ -132,6 +132,14 @@ def without(found: Iterable[SubscribeRequest], ids: Collection[str]) -> list[Sub
     return [each for each in left if each.tags]
 
 
+def is_last(parts: Iterable[SubscribeRequest]) -> bool:
+    """Whether a stored subscription is carried out after others, as a key for sorting.
+
+    Those with a profile are: a tag that it has gained must not displace one of another.
+    """
+    return any(part.profile is not None for part in parts)
+
+
 def joined(parts: Sequence[SubscribeRequest]) -> SubscribeRequest:
     """Returns the stored requests of a subscription as one.
 

@@ -14,6 +14,7 @@ from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.availability import MAX_RETRY_S
 from holdfast.scanner.jetstream.entries import (
+    is_last,
     joined,
     number,
     numbered,
@@ -185,8 +186,7 @@ class StoredSubscriptions(Placement):
 
     async def _restore_device(self, host: SubscriptionHost, owners: list[SubscriptionKey]) -> None:
         pending = [(owner, self._pending.get(owner, [])) for owner in owners]
-        # Those with a profile last: a tag that it has gained must not displace one of another.
-        for owner, found in sorted(pending, key=lambda each: any(part.profile for part in each[1])):
+        for owner, found in sorted(pending, key=lambda each: is_last(each[1])):
             if not found or self._pending.get(owner) is not found:
                 continue  # A caller has changed it.
             try:
