@@ -19,10 +19,23 @@ pub(crate) fn poll_receive(
     context: &mut Context<'_>,
     input: &mut [u8],
 ) -> Poll<io::Result<usize>> {
+    ready!(socket.poll_read_ready(context))?;
+    poll_receive_unlimited(socket, context, input)
+}
+
+/// As `poll_receive`, for a task that yields by itself: the runtime does not limit how often it receives before
+/// other tasks run.
+#[inline]
+pub(crate) fn poll_receive_unlimited(
+    socket: &TcpStream,
+    context: &mut Context<'_>,
+    input: &mut [u8],
+) -> Poll<io::Result<usize>> {
     loop {
-        ready!(socket.poll_read_ready(context))?;
         match receive(socket, input) {
-            Err(error) if error.kind() == ErrorKind::WouldBlock => {}
+            Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                ready!(socket.poll_read_ready(context))?;
+            }
             received => return Poll::Ready(received),
         }
     }

@@ -93,6 +93,8 @@ pub(crate) struct Connection<F: Framing, S> {
     reads_in_turn: u32,
     /// Whether the runtime may not know that there are bytes to read.
     is_unaware: bool,
+    /// Whether the last read took all that had arrived.
+    has_read_all: bool,
     share: Share,
 }
 
@@ -150,6 +152,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             unsent: Vec::new(),
             reads_in_turn: 0,
             is_unaware: false,
+            has_read_all: false,
             share,
         }
     }
@@ -241,7 +244,10 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
                 return stream::poll_end(self.stream.socket(), context).map(Err);
             }
         }
-        if self.share.poll(context).is_pending() {
+        // Most peers send one request at a time: behind it, there is nothing yet that takes a share.
+        let is_idle =
+            std::mem::take(&mut self.has_read_all) && self.stream.poll_ready(context).is_pending();
+        if is_idle || self.share.poll(context).is_pending() {
             self.reads_in_turn = 0;
             return Poll::Pending;
         }
@@ -254,7 +260,8 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
     fn poll_read(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Kind>> {
         SCRATCH.with_borrow_mut(|Scratch { input, output }| {
             let partial = self.answering.restore(input);
-            let free = &mut input[partial..][..self.answering.room()];
+            let room = self.answering.room();
+            let free = &mut input[partial..][..room];
             let unsent = &mut self.unsent;
             let known = if self.is_unaware { self.stream.read_now(free, unsent) } else { None };
             self.is_unaware = known.is_some();
@@ -268,6 +275,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             };
             self.reads_in_turn += 1;
             let read = read?;
+            self.has_read_all = !self.is_unaware && read < room;
             self.renew()?;
             self.answering.gives_up =
                 !F::HAS_IDS && self.answering.is_waiting() && self.deadlines.has_paused();

@@ -45,6 +45,12 @@ pub(crate) trait Stream: Send {
         unsent: &mut Vec<u8>,
     ) -> Poll<Result<usize, End>>;
 
+    /// Ready when another read may bring something, after one that brought less than there was room for.
+    #[inline]
+    fn poll_ready(&self, _context: &mut Context<'_>) -> Poll<()> {
+        Poll::Ready(())
+    }
+
     /// Reads once what the system has already received; `None` when there is no more.
     fn read_now(&mut self, input: &mut [u8], unsent: &mut Vec<u8>) -> Option<usize>;
 
@@ -71,11 +77,17 @@ impl Stream for TcpStream {
         input: &mut [u8],
         _unsent: &mut Vec<u8>,
     ) -> Poll<Result<usize, End>> {
-        socket_calls::poll_receive(self, context, input).map(|received| match received {
+        let received = socket_calls::poll_receive_unlimited(self, context, input);
+        received.map(|received| match received {
             Err(_) => Err(End::Broken),
             Ok(0) => Err(End::ByPeer),
             Ok(len) => Ok(len),
         })
+    }
+
+    #[inline]
+    fn poll_ready(&self, context: &mut Context<'_>) -> Poll<()> {
+        self.poll_read_ready(context).map(|_| ())
     }
 
     fn read_now(&mut self, input: &mut [u8], _unsent: &mut Vec<u8>) -> Option<usize> {
