@@ -5,9 +5,11 @@
 
 use std::io::{self, ErrorKind};
 use std::task::{Context, Poll, ready};
+use std::time::Duration;
 
 #[cfg(target_os = "linux")]
 use rustix::net::{RecvFlags, SendFlags};
+use socket2::SockRef;
 #[cfg(target_os = "linux")]
 use tokio::io::Interest;
 use tokio::net::TcpStream;
@@ -69,4 +71,25 @@ pub(crate) fn send(socket: &TcpStream, output: &[u8]) -> io::Result<usize> {
     });
     #[cfg(not(target_os = "linux"))]
     return socket.try_write(output);
+}
+
+/// How long the system repeats bytes of a connection that its peer does not acknowledge. Without a limit, it does
+/// so for minutes, also for a process that has ended: once the network is back, a device would get a write that was
+/// given up long ago. Only Linux has such a limit.
+#[derive(Debug, Default)]
+pub(crate) struct ResendLimit(Duration);
+
+impl ResendLimit {
+    /// Called before a request is sent. The limit is the longest timeout so far in whole seconds, rounded up: it
+    /// seldom changes, and a device that acknowledges late is not taken for one that is gone.
+    #[inline]
+    pub(crate) fn cover(&mut self, socket: SockRef<'_>, timeout: Duration) {
+        if timeout > self.0 {
+            self.0 = Duration::from_secs(timeout.as_millis().div_ceil(1000) as u64);
+            #[cfg(target_os = "linux")]
+            let _ = socket.set_tcp_user_timeout(Some(self.0));
+            #[cfg(not(target_os = "linux"))]
+            let _ = socket;
+        }
+    }
 }

@@ -4,8 +4,11 @@ use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream, UdpSocket};
 use std::time::{Duration, Instant};
 
+use socket2::SockRef;
+
 use crate::name_lookup::{self, Unresolved};
 use crate::serial_line::OpenLine;
+use crate::socket_calls::ResendLimit;
 use crate::tls::TlsFailure;
 
 /// The shortest timeout that all systems accept.
@@ -102,6 +105,7 @@ pub(super) struct TcpByteStream {
     socket: TcpStream,
     read_timeout: Duration,
     write_timeout: Duration,
+    resend_limit: ResendLimit,
 }
 
 impl TcpByteStream {
@@ -118,7 +122,12 @@ impl TcpByteStream {
             TcpStream::connect_timeout(&address, timeout.max(MIN_TIMEOUT))
         })?;
         socket.set_nodelay(true)?;
-        Ok(TcpByteStream { socket, read_timeout: Duration::ZERO, write_timeout: Duration::ZERO })
+        Ok(TcpByteStream {
+            socket,
+            read_timeout: Duration::ZERO,
+            write_timeout: Duration::ZERO,
+            resend_limit: ResendLimit::default(),
+        })
     }
 
     /// Runs an operation on the socket without blocking.
@@ -159,6 +168,7 @@ impl ByteStream for TcpByteStream {
             self.socket.set_write_timeout(Some(timeout))?;
             self.write_timeout = timeout;
         }
+        self.resend_limit.cover(SockRef::from(&self.socket), timeout);
         Ok(self.socket.write_all(bytes)?)
     }
 
@@ -264,6 +274,9 @@ fn first<T>(
 mod tests {
     use super::*;
 
+    #[cfg(target_os = "linux")]
+    const MINUTE: Duration = Duration::from_secs(60);
+
     fn address(port: u16) -> SocketAddr {
         ([127, 0, 0, 1], port).into()
     }
@@ -277,6 +290,17 @@ mod tests {
         });
         assert_eq!(opened.unwrap(), address(2));
         assert_eq!(tried.into_inner(), [(1, 2), (2, 1)]);
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn the_system_repeats_no_request_for_much_longer_than_its_timeout() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let (port, deadline) = (listener.local_addr().unwrap().port(), Instant::now() + MINUTE);
+        let mut stream = TcpByteStream::connect("127.0.0.1", port, deadline).unwrap();
+        stream.send(&[0], deadline).unwrap();
+        let limit = SockRef::from(&stream.socket).tcp_user_timeout().unwrap();
+        assert!(limit.is_some_and(|limit| !limit.is_zero() && limit <= MINUTE), "{limit:?}");
     }
 
     #[test]

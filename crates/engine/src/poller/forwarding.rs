@@ -12,6 +12,7 @@ use std::time::Duration;
 use holdfast_memory::Area;
 use holdfast_protocol::raw_ingest::{DONE, Format, Header};
 use holdfast_runtime::{Counter, Retry, lock};
+use socket2::SockRef;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
 use tokio::sync::Notify;
@@ -21,6 +22,7 @@ use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
 use crate::link::{Fence, agree, dial};
 use crate::name_lookup;
 use crate::raw_ingest_areas::in_packet;
+use crate::socket_calls::ResendLimit;
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
@@ -270,6 +272,8 @@ impl Forward {
     async fn send(&self, packet: &[u8], deadline: Instant) -> io::Result<u8> {
         let found = name_lookup::addresses_of(&self.settings.host, self.settings.port).await?;
         let mut stream = dial(found, deadline).await?;
+        let timeout = deadline.saturating_duration_since(Instant::now());
+        ResendLimit::default().cover(SockRef::from(&stream), timeout);
         if let Some(tls) = &self.settings.tls {
             let channel = agree(&mut stream, tls).await?;
             self.check_lease()?;

@@ -15,6 +15,7 @@ use holdfast_protocol::client::{
 };
 use holdfast_protocol::pdu::EncodedRequest;
 use holdfast_runtime::Retry;
+use socket2::SockRef;
 use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedReadHalf;
 use tokio::sync::{Mutex, oneshot};
@@ -31,7 +32,7 @@ use crate::link::scheduling::in_flight::Pace;
 use crate::link::sockets::connect::dial;
 use crate::link::sockets::handshake;
 use crate::name_lookup;
-use crate::socket_calls::{self, poll_receive};
+use crate::socket_calls::{self, ResendLimit, poll_receive};
 use crate::tls::client::ClientTls;
 use crate::tls::{Channel, TlsFailure};
 
@@ -85,6 +86,7 @@ struct Open {
     /// Late replies that were counted.
     late: u64,
     writer: tokio::net::tcp::OwnedWriteHalf,
+    resend_limit: ResendLimit,
     tls: Option<Channel>,
     /// Bytes that the socket has not accepted yet.
     unsent: Vec<u8>,
@@ -258,6 +260,7 @@ impl TcpLink {
             strays: Arc::clone(&self.strays),
             late: 0,
             writer,
+            resend_limit: ResendLimit::default(),
             tls,
             unsent: Vec::new(),
             reader: None,
@@ -281,6 +284,7 @@ impl TcpLink {
         let found = open.as_mut().ok_or(LOST)?;
         let now = Instant::now();
         let timeout = deadline.saturating_duration_since(now);
+        found.resend_limit.cover(SockRef::from(found.writer.as_ref()), timeout);
         let sent = now - found.epoch;
         let ticket = found.connection.send_again(unit_id, request, timeout, attempt, sent);
         match ticket {
@@ -525,6 +529,37 @@ mod tests {
         let until = Some((Instant::now() + time).into_std());
         let permit = Permit { until, ..Permit::default() };
         link.call(1, &write, TIMEOUT, Priority::Urgent, &permit).await
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn the_system_repeats_no_request_for_much_longer_than_the_longest_timeout() {
+        let runtime = Builder::new_current_thread().enable_all().build().unwrap();
+        LocalSet::new().block_on(&runtime, async {
+            let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+            let place = ("127.0.0.1".to_owned(), listener.local_addr().unwrap().port());
+            let link = TcpLink::new(place, None, Default::default(), String::new());
+            let device = spawn_local(async move {
+                let (mut device, _) = listener.accept().await.unwrap();
+                let mut request = [0; 12];
+                while device.read_exact(&mut request).await.is_ok() {
+                    device.write_all(&request).await.unwrap();
+                }
+            });
+            let request = Request::WriteSingleRegister { address: 0, value: 1 };
+            let write = EncodedRequest::new(&request);
+            for (timeout_ms, limit_s) in [(58_900, 59), (60_200, 61), (59_500, 61)] {
+                let timeout = Duration::from_millis(timeout_ms);
+                let pace = Pace::new(InFlight::Fixed(1));
+                let permit = Permit::default();
+                link.exchange(&pace, 1, &write, timeout, true, &permit).await.unwrap();
+                let open = link.open.borrow();
+                let socket = SockRef::from(open.as_ref().unwrap().writer.as_ref());
+                let limit = socket.tcp_user_timeout().unwrap();
+                assert_eq!(limit, Some(Duration::from_secs(limit_s)));
+            }
+            device.abort();
+        });
     }
 
     #[test]
