@@ -85,7 +85,7 @@ impl ResendLimit {
     #[inline]
     pub(crate) fn cover(&mut self, socket: SockRef<'_>, timeout: Duration) {
         if timeout > self.0 {
-            self.0 = Duration::from_secs(timeout.as_millis().div_ceil(1000) as u64);
+            self.0 = Duration::from_secs(timeout.as_secs_f64().ceil() as u64);
             #[cfg(target_os = "linux")]
             let _ = socket.set_tcp_user_timeout(Some(self.0));
             #[cfg(not(target_os = "linux"))]
