@@ -7,11 +7,13 @@ import queue
 import time
 import urllib.request
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 
 import holdfast
+from holdfast.adapters.metrics.families import tag_metrics
 from holdfast.appliance import Appliance
 from holdfast.appliance.parts import tag_values
 from holdfast.appliance.parts.tag_values import TagValues
@@ -376,6 +378,20 @@ def test_a_backlog_is_handled_in_turns_and_losses_are_counted(
     assert turns == [1] * 5
     assert events == [("tag_polls_dropped", 7)]
     assert found.dropped == 7
+
+
+def test_the_age_of_a_value_does_not_follow_the_clock(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clocks = SimpleNamespace(time=lambda: 1_700_000_002.0, monotonic=lambda: 50.0)
+    monkeypatch.setattr(tag_values, "time", clocks)
+    found = TagValues(cast("Any", Polls()), 0.0)
+    found.adopt(load(saved(tmp_path, settings(502))))
+    blocks: list[Any] = [("holding_registers", 0, 6, bytes(12), 0, 1_700_000_000.0)]
+    found._handle(deque([("m", 0.0, blocks)]))
+    clocks.time, clocks.monotonic = lambda: 1_700_003_602.0, lambda: 55.0
+    _, ages = tag_metrics(cast("Any", SimpleNamespace(tag_values=found.latest_with_ages)))
+    assert {sample.value for sample in ages.samples} == {7.0}
 
 
 def test_values_are_metrics(tmp_path: Path, device: int, memory: holdfast.Memory) -> None:

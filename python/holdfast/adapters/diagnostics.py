@@ -20,8 +20,8 @@ class DiagnosticsSource(Protocol):
     def stats(self) -> dict[str, Any]:
         """Returns all counters since the start."""
 
-    def tag_values(self) -> list[Reading]:
-        """Returns the last reading of each tag."""
+    def tag_values(self) -> list[tuple[Reading, float]]:
+        """Returns the last reading of each tag, and its age in seconds."""
 
     def adapter(self, name: str) -> dict[str, Any] | None:
         """Returns the state and the counters of one adapter; `None` if it does not exist."""

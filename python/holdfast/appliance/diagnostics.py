@@ -26,8 +26,8 @@ class Diagnostics:
     _liveness: Liveness
     _parts: Sequence[Part]
     adapters: dict[str, Supervisor]
-    tag_values: Callable[[], list[Reading]]
-    """Returns the last reading of each tag of the configured devices."""
+    tag_values: Callable[[], list[tuple[Reading, float]]]
+    """Returns the last reading of each tag of the configured devices, and its age in seconds."""
     _began: float = field(default_factory=time.monotonic)
     _reload: dict[str, Any] = field(
         default_factory=lambda: {"failed": False, "succeeded_at": time.time()}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING, Any
 
 from prometheus_client.core import (
@@ -128,11 +127,10 @@ def tag_metrics(diagnostics: DiagnosticsSource) -> Iterator[Metric]:
     """Yields the values that are numbers or bits. A tag without a value has no sample."""
     values = _gauge("tag_value", "The value of a tag.", "device", "tag", "unit")
     ages = _gauge("tag_age_seconds", "The age of the value of a tag.", "device", "tag")
-    now = time.time()
-    for reading in diagnostics.tag_values():
+    for reading, age in diagnostics.tag_values():
         for name, value in _numbers(reading.name, plain(reading.tag, reading.value)):
             values.add_metric([reading.device, name, reading.tag.unit], value)
-            ages.add_metric([reading.device, name], max(0.0, now - reading.time))
+            ages.add_metric([reading.device, name], age)
     yield from (values, ages)
 
 

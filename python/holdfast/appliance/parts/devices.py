@@ -179,9 +179,9 @@ class Devices(Part):
         """The health of each polled device when `tick` looked last. Thread-safe."""
         return dict(self._events.health)
 
-    def readings(self) -> list[Reading]:
-        """The last reading of each tag. Thread-safe."""
-        return [] if self.values is None else self.values.latest()
+    def readings(self) -> list[tuple[Reading, float]]:
+        """The last reading of each tag, and its age in seconds. Thread-safe."""
+        return [] if self.values is None else self.values.latest_with_ages()
 
     def _counters(self) -> dict[str, dict[str, Any]]:
         """The counters of the devices in the configuration. Those of the scanner have a slash."""

@@ -110,7 +110,9 @@ class TagValues:
         """When a replaced device began, in seconds since the poller's start: polls from before are
         those of the device that it has replaced."""
         self._outputs: dict[str, _Output] = {}
-        self._latest: dict[str, DevicePoll] = {}
+        self._latest: dict[str, tuple[DevicePoll, float]] = {}
+        """The last poll of each device, and by how much the clock was ahead of `time.monotonic`
+        when it came."""
         self._answering: dict[str, bool] = {}
         self.standby: frozenset[str] = frozenset()
         """The devices with tags that another node polls. Replaced as a whole."""
@@ -215,7 +217,17 @@ class TagValues:
     def latest(self) -> list[Reading]:
         """The last reading of each tag. Thread-safe."""
         with self._lock:
-            return [reading for poll in self._latest.values() for reading in poll.readings]
+            return [reading for poll, _ in self._latest.values() for reading in poll.readings]
+
+    def latest_with_ages(self) -> list[tuple[Reading, float]]:
+        """The same, each with its age in seconds, also after the clock was set. Thread-safe."""
+        with self._lock:
+            now = time.monotonic()
+            return [
+                (reading, max(0.0, now + ahead - reading.time))
+                for poll, ahead in self._latest.values()
+                for reading in poll.readings
+            ]
 
     def tags(self) -> dict[str, tuple[Tag, ...]]:
         """The tags of each device. Thread-safe."""
@@ -233,7 +245,7 @@ class TagValues:
         with self._lock:
             if (known := self._outputs.get(output)) is not None:
                 known.changes.forget(self._readers)
-                known.offer(self._latest.values())
+                known.offer(poll for poll, _ in self._latest.values())
 
     def heartbeat(self) -> ThreadHeartbeat | None:
         """The heartbeat of the thread; `None` before the start."""
@@ -285,8 +297,9 @@ class TagValues:
                 return
 
     def _offer(self, polls: Sequence[DevicePoll]) -> None:
+        ahead = time.time() - time.monotonic()
         for poll in polls:
-            self._latest[poll.device] = poll
+            self._latest[poll.device] = poll, ahead
             if poll.is_standby is not (poll.device in self.standby):
                 self.standby ^= {poll.device}
             answers = poll.has_answered
