@@ -61,6 +61,14 @@ def test_csv_has_a_head_and_one_line_for_each_value(tmp_path: Path) -> None:
     ]
 
 
+def test_a_text_with_a_carriage_return_is_one_cell_of_csv(tmp_path: Path) -> None:
+    file = TextFile(settings(tmp_path / "a.csv", "csv"))
+    file.send([reading("ABC123\r", tag=tag("s", type="string:8")), reading(1)])
+    file.close()
+    with (tmp_path / "a.csv").open(encoding="utf-8", newline="") as text:
+        assert [row[3] for row in csv.reader(text)] == ["value", "ABC123\r", "1"]
+
+
 def test_json_lines_have_one_object_for_each_value(tmp_path: Path) -> None:
     file = TextFile(settings(tmp_path / "a.jsonl", "jsonl"))
     file.send(READINGS)

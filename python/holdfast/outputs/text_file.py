@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 import os
 from datetime import UTC, datetime
@@ -16,9 +14,10 @@ from holdfast.events import log_lines
 from holdfast.events.rotation import Rotation
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.sending import Receiver
-from holdfast.tags.text import plain, text_of
+from holdfast.tags.text import csv_line, plain, text_of
 
 if TYPE_CHECKING:
+    import io
     from collections.abc import Callable
     from pathlib import Path
 
@@ -129,13 +128,12 @@ def row(reading: Reading) -> tuple[Any, ...]:
 
 
 def _csv(readings: list[Reading]) -> bytes:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
+    found = []
     for reading in readings:
         time, device, tag, _, unit, error = row(reading)
         value = text_of(reading.tag, reading.value, states=False)
-        writer.writerow((time, device, tag, value, unit, error))
-    return text.getvalue().encode()
+        found.append(csv_line((time, device, tag, value, unit, error)))
+    return "".join(found).encode()
 
 
 def _json_lines(readings: list[Reading]) -> bytes:

@@ -1,4 +1,4 @@
-"""Values of tags as text and for JSON, and text as values to write.
+"""Values of tags as text, in CSV and for JSON, and text as values to write.
 
 What `text_of` returns, `value_from` accepts, except for infinity, and scaled 64-bit integers with
 more digits than a float has.
@@ -7,6 +7,8 @@ more digits than a float has.
 from __future__ import annotations
 
 import base64
+import csv
+import io
 import math
 import re
 from fractions import Fraction
@@ -22,7 +24,7 @@ from holdfast.values import DoesNotFit
 from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterable
 
     from holdfast.tags.tag import Tag
 
@@ -71,6 +73,13 @@ def text_of(tag: Tag, value: Any, *, states: bool = True) -> str:
         places = None if tag.is_float else _places(tag.scale, tag.offset)
         return shortest(_trimmed(tag, value), "") if places is None else f"{value:.{places}f}"
     return str(value)
+
+
+def csv_line(cells: Iterable[object]) -> str:
+    """Cells as a line of CSV, which ends with a newline."""
+    text = io.StringIO()
+    csv.writer(text).writerow(cells)  # Its own end of line, so that it quotes "\r" and "\n".
+    return text.getvalue().removesuffix("\r\n") + "\n"
 
 
 def value_from(tag: Tag, text: str, *, states: bool = True) -> Any:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import os
 import stat
 from typing import TYPE_CHECKING
 
 from holdfast.cli import terminal_text
 from holdfast.events import log_lines
-from holdfast.tags.text import text_of
+from holdfast.tags.text import csv_line, text_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -35,7 +33,7 @@ class NotARecording(ValueError):
 
 def head(tags: Iterable[Tag]) -> str:
     """The line with the names of the columns."""
-    return _line(["time", *(tag.name for tag in tags)])
+    return csv_line(["time", *(tag.name for tag in tags)])
 
 
 def row(moment: float, readings: Sequence[Reading], *, is_shown: bool = False) -> str:
@@ -47,13 +45,7 @@ def row(moment: float, readings: Sequence[Reading], *, is_shown: bool = False) -
     cells = [text_of(each.tag, each.value, states=False) for each in readings]
     if is_shown:
         cells = [terminal_text.plain(cell) for cell in cells]
-    return _line([log_lines.timestamp(moment), *cells])
-
-
-def _line(cells: Sequence[str]) -> str:
-    text = io.StringIO()
-    csv.writer(text).writerow(cells)  # Its own end of line, so that it quotes "\r" and "\n".
-    return text.getvalue().removesuffix("\r\n") + "\n"
+    return csv_line([log_lines.timestamp(moment), *cells])
 
 
 class Recording:
