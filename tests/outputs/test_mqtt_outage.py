@@ -88,7 +88,9 @@ def test_nothing_is_lost_or_out_of_order(plant: Plant, tmp_path: Path) -> None:
         # On a loaded machine, the output may be offered the last polls much later.
         last = {3 * CHANGES - 1}
         readings = appliance.diagnostics.tag_values
-        wire.until(lambda: {each.value for each, _ in readings()} == last, "all is offered", SECONDS)
+        wire.until(
+            lambda: {each.value for each, _ in readings()} == last, "all is offered", SECONDS
+        )
         wire.until(lambda: plant.status()["waiting"] == 0, "all is sent", SECONDS)
         wire.until(lambda: plant.status()["connected"], "connected")
         assert plant.count("dropped") == plant.count("refused") == 0

@@ -172,6 +172,40 @@ def test_a_line_that_a_crash_has_cut_off_is_removed(
     assert (record.message, vars(record)["fields"]) == ("output_line_cut", fields)
 
 
+@pytest.mark.parametrize("kind", ["csv", "influx"])
+def test_a_row_that_is_cut_off_anywhere_is_removed(tmp_path: Path, kind: str) -> None:
+    """Also within a text with a newline: its quote would take in the next row."""
+    path = tmp_path / "a"
+
+    def sent(*texts: str) -> bytes:
+        file = TextFile(settings(path, kind))
+        for text in texts:
+            file.send([reading(text, tag=tag("s", type="string:20"))])
+        file.close()
+        return path.read_bytes()
+
+    two = sent("A1\nLOT7", "A2")
+    last = 'A3\n"x" \\\n"\nLOT8'
+    whole = sent(last)
+    for end in range(len(two), len(whole)):
+        path.write_bytes(whole[:end])
+        assert sent(last) == whole, whole[len(two) : end]
+
+
+@pytest.mark.parametrize("kind", ["csv", "influx"])
+def test_a_text_that_looks_like_a_row_is_not_cut_off(
+    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    for before in range(3):
+        file = TextFile(settings(tmp_path / "a", kind))
+        file.send(
+            [reading(f"{before}\n{TIME},\nmodbus,device=x\n", tag=tag("s", type="string:60"))]
+        )
+        file.close()
+    assert (tmp_path / "a").read_bytes().count(b"modbus,device=x\n") == 3
+    assert not caplog.records
+
+
 @pytest.mark.parametrize("content", [b"\n\0\nSQLite", b"{}", b"time,device\n" + b"x" * (1 << 20)])
 def test_what_no_output_has_written_is_not_removed(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a"

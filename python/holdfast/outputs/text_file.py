@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
@@ -39,7 +40,7 @@ class TextFile(Receiver):
         self._rotation = Rotation(settings.file, settings.keep, self._not_rotated)
         self._encode = ENCODINGS[settings.format]
         self._head = f"{','.join(COLUMNS)}\n".encode() if settings.format == "csv" else b""
-        self._begins = BEGINS[settings.format]
+        self._form = FORMS[settings.format]
         self._open: io.FileIO | None = None
 
     def send(self, readings: list[Reading]) -> None:
@@ -74,7 +75,7 @@ class TextFile(Receiver):
         if self._open is None:
             self._rotation.take_up()
             self._open = self._file.open("ab", buffering=0)
-            _end_line(self._open, self._file, self._begins)
+            _end_line(self._open, self._file, self._form)
         size = self._open.seek(0, os.SEEK_END)
         if size and size + more > self._max_bytes and self._rotation.may_rotate:
             self.close()
@@ -93,8 +94,20 @@ def _is_same(file: io.FileIO, path: Path) -> bool:
         return False
 
 
-def _end_line(file: io.FileIO, path: Path, begins: bytes) -> None:
-    """Removes a line that a crash has cut off: half of a value can be a wrong one.
+class Form(NamedTuple):
+    """How a file of an output is known, and what of its end is whole."""
+
+    begin: bytes
+    """How the file begins."""
+    row: re.Pattern[bytes]
+    """How a row begins."""
+    whole: re.Pattern[bytes]
+    """Whole rows. A text in quotes can have newlines."""
+
+
+def _end_line(file: io.FileIO, path: Path, form: Form) -> None:
+    """Removes a row that a crash has cut off: half of a value can be a wrong one, and a quote that
+    nothing closes would take in the next row.
 
     In a file that does not begin as an output does, the line is another's: it is only ended.
     """
@@ -102,10 +115,10 @@ def _end_line(file: io.FileIO, path: Path, begins: bytes) -> None:
     if not size:
         return
     with path.open("rb") as reading:
-        is_own = reading.read(len(begins)) == begins
+        is_own = reading.read(len(form.begin)) == form.begin
         reading.seek(max(0, size - MAX_LINE_BYTES))
         tail = reading.read()
-    cut = len(tail) - (tail.rfind(b"\n") + 1)
+    cut = _cut_off(tail, form) if is_own else len(tail) - (tail.rfind(b"\n") + 1)
     if not cut:
         return
     if is_own and cut < MAX_LINE_BYTES:
@@ -113,6 +126,14 @@ def _end_line(file: io.FileIO, path: Path, begins: bytes) -> None:
         log_lines.write(logging.WARNING, "output_line_cut", file=str(path), bytes=cut)
     else:
         file.write(b"\n")
+
+
+def _cut_off(tail: bytes, form: Form) -> int:
+    """The bytes behind the last whole row."""
+    # From the last two: what looks like the last one may be within a text.
+    begins = [found.start() for found in form.row.finditer(tail)][-2:] or [0]
+    ends = (next(form.whole.finditer(tail, begin)).end() for begin in begins)
+    return len(tail) - max(ends)
 
 
 def row(reading: Reading) -> tuple[Any, ...]:
@@ -153,9 +174,22 @@ ENCODINGS: dict[str, Callable[[list[Reading]], bytes]] = {
     "influx": _influx,
 }
 
-BEGINS: dict[str, bytes] = {
-    "csv": b"time,",
-    "jsonl": b'{"time":',
-    "influx": f"{MEASUREMENT},device=".encode(),
+_INFLUX = f"{MEASUREMENT},device=".encode()
+
+FORMS = {
+    "csv": Form(
+        b"time,",
+        re.compile(rb"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9:.]{15}Z,", re.MULTILINE),
+        re.compile(rb'(?:(?:[^"\n]++|"[^"]*+")*+\n)*+'),
+    ),
+    "jsonl": Form(
+        b'{"time":',
+        re.compile(rb'^\{"time":', re.MULTILINE),
+        re.compile(rb"(?:[^\n]*+\n)*+"),
+    ),
+    "influx": Form(
+        _INFLUX,
+        re.compile(b"^" + _INFLUX, re.MULTILINE),
+        re.compile(rb'(?:(?:[^"\n]++|"(?:[^"\\]++|\\.)*+")*+\n)*+', re.DOTALL),
+    ),
 }
-"""How a file of an output begins."""
