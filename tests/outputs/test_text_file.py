@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import sqlite3
 import sys
 from contextlib import closing
@@ -83,6 +84,14 @@ def test_json_lines_have_one_object_for_each_value(tmp_path: Path) -> None:
         "unit": "°C",
         "error": None,
     }
+
+
+@pytest.mark.parametrize(("kind", "value"), [("csv", ",inf,,"), ("jsonl", '"value":null')])
+def test_infinity_is_a_word_in_csv_and_null_in_json(tmp_path: Path, kind: str, value: str) -> None:
+    file = TextFile(settings(tmp_path / "a", kind))
+    file.send([reading(math.inf)])
+    file.close()
+    assert value in (tmp_path / "a").read_text("utf-8")
 
 
 def test_line_protocol_can_be_written_to_a_file(tmp_path: Path) -> None:
