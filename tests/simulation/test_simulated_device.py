@@ -399,7 +399,7 @@ def test_numbers_that_registers_do_not_have_are_refused(
     kind: str, value: float, writable: bool
 ) -> None:
     tags = TagList([Tag("t", "holding_registers", 0, kind, writable=writable)])
-    with pytest.raises(Refused, match=r"^t: .* is not a finite number$"):
+    with pytest.raises(Refused, match=r"t: .* is not a finite number$"):
         SimulatedDevice(tags, played={"t": [value]})
     with pytest.raises(Refused, match=r"^t: .* is not a finite number$"):
         SimulatedDevice(tags, chosen={"t": generators.constant(value)})
@@ -508,6 +508,24 @@ def test_rows_are_played_with_the_scale_of_their_row() -> None:
         SimulatedDevice(tags, played={"power": [300, 300_000], "sf": [1, 0]})
     with pytest.raises(Refused, match=r"scale 0.01 in holding_registers 4.*found 300000 W"):
         SimulatedDevice(tags, played={"power": [300_000], "sf": [1, -2]})
+
+
+def test_rows_without_a_valid_scale_are_played(tmp_path: Path) -> None:
+    """As `--record` writes them: 0x8000 is no exponent, and the value has an error."""
+    file = tmp_path / "recorded.csv"
+    file.write_text("time,power,sf\n0,,-32768\n1,300,0\n2,,-32768\n")
+    tags = scaled_tags()
+    device = SimulatedDevice(tags, played=playback.load(file, tags))
+    found = []
+    for _ in range(3):
+        found.append(device.memory.read("holding_registers", 0, 5)[::4])
+        device.step()
+    assert found == [[0, 0x8000], [300, 0], [300, 0x8000]]
+
+
+def test_a_played_value_that_does_not_fit_with_its_scale_names_its_row() -> None:
+    with pytest.raises(Refused, match="row 2 of the values: power holds -32768 to 32767 W"):
+        SimulatedDevice(scaled_tags(), played={"power": [300, 300_000], "sf": [1, 0]})
 
 
 def test_a_written_scale_is_that_of_the_next_values(serve_simulated: Any) -> None:

@@ -128,10 +128,11 @@ class SimulatedDevice:
         """What the values of a tag do. Raises `Refused` if they, or those played, do not fit."""
         within = self._scales.within(tag) if tag.is_number else (0.0, 0.0)
         try:
-            found = of or generators.usual(self._with_scale(tag), *within)
             if played is not None:
                 self._scales.check_played(tag, played)
-            elif found.kind == "counter":
+                return generators.still(tag)  # Not used: what is played takes precedence.
+            found = of or generators.usual(self._with_scale(tag), *within)
+            if found.kind == "counter":
                 least_step = self._scales.least_step(tag)
                 self._scales.check(tag, [0, found.first_count(step, least_step)])
                 found = found.turning(*within, least_step)

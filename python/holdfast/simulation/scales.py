@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast import values
 from holdfast.simulation.capacity import Capacity, extremes, nearest
 from holdfast.tags.scale import RegisterScale
+from holdfast.values import DoesNotFit
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -51,16 +52,23 @@ class Scales:
             capacity.check(value)
 
     def check_played(self, tag: Tag, values: Sequence[Any]) -> None:
-        """The same for values that are played. A scale that is played belongs to one row."""
+        """The same for values that are played. A scale that is played belongs to one row.
+
+        The message has the row.
+        """
         source = tag.source
         rows = None if source is None else self._rows.get((source.area, source.address))
         if rows is None or len(rows) != len(values):
-            self.check(tag, values)
-            return
-        by_content = {each: self._capacities([each], tag) for each in dict.fromkeys(rows)}
-        for content, value in zip(rows, values, strict=True):
-            for capacity in by_content[content]:
-                capacity.check(value)
+            of_rows = [self._capacities(self._all_contents(tag), tag)] * len(values)
+        else:
+            by_content = {each: self._capacities([each], tag) for each in dict.fromkeys(rows)}
+            of_rows = [by_content[content] for content in rows]
+        for row, (value, capacities) in enumerate(zip(values, of_rows, strict=True), 1):
+            for capacity in capacities:
+                try:
+                    capacity.check(value)
+                except DoesNotFit as error:
+                    raise DoesNotFit(f"row {row} of the values: {error}") from None
 
     def within(self, tag: Tag) -> tuple[float, float]:
         """The range that registers of a number can hold with all of the scales."""
