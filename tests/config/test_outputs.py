@@ -48,6 +48,11 @@ DEVICE = "devices: {a: {url: tcp://a, tags: {x: {area: coils, address: 1}}, inte
         ("{type: influx, url: 'ftp://h', bucket: b}", "o.url: found neither http:// nor https://"),
         ("{type: influx, url: 'http://h/a b'}", "o.url: found a path with blanks"),
         ("{type: influx, url: 'http://u:p@h/w'}", "o.url: found a user in the URL"),
+        (
+            "{type: influx, url: 'http://h/w', measurement: '#1 pump'}",
+            "o.measurement: found '#1 pump', allowed: text that neither begins with # nor ends in",
+        ),
+        ("{type: influx, url: 'http://h/w', measurement: 'a\\'}", "o.measurement: found 'a"),
         ("{type: influx, url: 'http://h/w', tls: {}}", "o.tls: found with http://, allowed: only"),
         (
             "{type: influx, url: 'http://h/w', username: u}",

@@ -789,6 +789,10 @@ def test_measurements(imported: Callable[[str], Imported]) -> None:
     place = "7: inputs.modbus[0].metric[0].measurement"
     several = "an output has one measurement; add outputs with devices for several"
     assert f"{place}: left out: {several}" in notes(found)
+    found = imported(metric.replace("grid", "#1") + OUTPUT)
+    assert "measurement" not in found.data["outputs"]["influx"]
+    form = "a measurement is text that neither begins with # nor ends in a backslash"
+    assert f"{place}: left out: {form}" in notes(found)
     none = "no output is converted; see measurement of outputs"
     assert f"{place}: left out: {none}" in notes(imported(metric))
 

@@ -13,6 +13,7 @@ from holdfast.config.values.scalars import (
     Duration,
     FilePath,
     HttpUrl,
+    Measurement,
     MqttText,
     MqttVersion,
     Name,
@@ -75,7 +76,7 @@ class InfluxConfig(OutputConfig):
     """A user name, instead of a token."""
     password_file: Annotated[FilePath | None, NotNull()] = None
     """A file that contains the password of the user."""
-    measurement: Annotated[str, Field(min_length=1)] = MEASUREMENT
+    measurement: Measurement = MEASUREMENT
     """The measurement of all points; each device is a tag, each tag of it a field."""
     tags: dict[Name, Annotated[str, Field(min_length=1)]] = Field(default={})
     """More tags of all points, such as the site."""

@@ -69,6 +69,7 @@ MIN_TIME = 0.001
 NOT_ON_A_LINE = f"; 0 is the broadcast, {MAX_SERIAL_UNIT + 1} to {MAX_UNIT} are reserved"
 MAX_SPARKPLUG_ID = 255
 NAME_FORM = "1 to 64 letters, digits, '_', '.' and '-'"
+MEASUREMENT_FORM = "text that neither begins with # nor ends in a backslash"
 _NAME = r"[A-Za-z0-9_.-]{1,64}"
 _STATUS_NAME = "[ -~]{0,16}"
 _BYTE = r"([01]?[0-9]?[0-9]|2[0-4][0-9]|25[0-5])"
@@ -245,6 +246,21 @@ def _sparkplug_id(value: object) -> str:
     return text
 
 
+def is_measurement(text: str) -> bool:
+    """Whether line protocol can have the measurement.
+
+    A line that begins with # is a comment, and a backslash at the end would escape what follows.
+    Nothing escapes either.
+    """
+    return not text.startswith("#") and not text.endswith("\\")
+
+
+def _measurement(text: str) -> str:
+    if not is_measurement(text):
+        raise ValueError(f"found {show(text)}, allowed: {MEASUREMENT_FORM}")
+    return text
+
+
 def _text_of(most: int, least: int = 1) -> Callable[[object], str]:
     """A validator for text of `least` to `most` bytes."""
     allowed = f"allowed: text of {least} to {most} bytes"
@@ -398,6 +414,7 @@ ReceiverUrl = Annotated[
 TopicFilter = Annotated[str, Parsed(parse_topic_filter, minLength=1, maxLength=MAX_TEXT)]
 TopicName = Annotated[str, Parsed(parse_topic_name, minLength=1, maxLength=MAX_TEXT)]
 TopicTemplate = Annotated[str, Parsed(parse_topic_template, "plant/{device}/{tag}")]
+Measurement = Annotated[str, Field(min_length=1), AfterValidator(_measurement)]
 SparkplugId = Annotated[str, Parsed(_sparkplug_id, pattern="^[^+/#]{1,255}$")]
 PeerAddress = Annotated[str, Parsed(parse_peer)]
 Source = Annotated[

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.values.scalars import NAME_FORM, is_name
+from holdfast.config.values.scalars import MEASUREMENT_FORM, NAME_FORM, is_measurement, is_name
 from holdfast.importing.imported import Imported, NotImportable
 from holdfast.importing.key_reader import Section, section
 from holdfast.importing.names import free_name, unique_names
@@ -228,7 +228,12 @@ def _measurement(desk: Desk, fields: list[Field]) -> str:
     """The measurement of all fields; if they have several, notes that the output has one."""
     all_of_them = {each.measurement for each in fields}
     if len(all_of_them) == 1:
-        return all_of_them.pop()
+        [found] = all_of_them
+        if is_measurement(found):
+            return found
+        first = fields[0]
+        desk.left_out(first.measured_at or first.path, f"a measurement is {MEASUREMENT_FORM}")
+        return MEASUREMENT
     for each in fields:
         if each.measured_at is not None:
             message = "an output has one measurement; add outputs with devices for several"
