@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from typing import TYPE_CHECKING
@@ -93,6 +94,31 @@ def test_outputs_without_tags_have_no_effect(tmp_path: Path) -> None:
     )
     [doubt] = load(file).warnings
     assert str(doubt) == f"{file}:3: outputs: has no effect: no device has tags"
+
+
+def test_names_that_influxdb_does_not_take_or_confuses_give_warnings(tmp_path: Path) -> None:
+    file = tmp_path / "p.yaml"
+    tags = {
+        name: {"area": "coils", "address": at, "type": kind}
+        for at, (name, kind) in enumerate(
+            {"time": "bool", "device": "bool", "site": "bool", "line": "bool[2]"}.items()
+        )
+    }
+    device = {"url": "tcp://h", "interval": 1, "tags": tags}
+    named = {"time": "x", "site": "north", "line": "1"}
+    influx = {"type": "influx", "url": "http://h/w", "tags": named}
+    outputs = {"o": influx, "other": {**influx, "tags": {}, "devices": ["b"]}}
+    other = {**device, "tags": {"a": tags["site"]}}
+    made = {"devices": {"d": device, "e": device, "b": other}, "outputs": outputs}
+    file.write_text(json.dumps(made))
+    confused = "as a tag of all points: queries of InfluxDB confuse them"
+    assert [str(each).partition(": ")[2] for each in load(file).warnings] == [
+        "outputs.o.tags.time: InfluxDB refuses all points with a tag of this name",
+        "outputs.o: found the tag time of d: InfluxDB stores no field of this name, its values are "
+        "lost",
+        f"outputs.o: found the tag device of d, and device {confused}",
+        f"outputs.o: found the tag site of d, and site {confused}",
+    ]
 
 
 def test_what_is_written_to_own_files_is_no_change_of_the_configuration(tmp_path: Path) -> None:

@@ -99,9 +99,11 @@ def warn_of_outputs(scope: Scope) -> None:
         scope.report.warn(("outputs",), "has no effect: no device has tags")
     owners: dict[tuple[str, int, str], str] = {}
     for name, output in config.outputs.items():
+        path: KeyPath = ("outputs", name)
+        if isinstance(output, InfluxConfig):
+            _warn_of_influx(scope, path, output)
         if not isinstance(output, MqttOutputConfig):
             continue
-        path: KeyPath = ("outputs", name)
         status = output.topics.status
         owner = owners.setdefault((output.host, output.port, status), name)
         if owner != name:
@@ -113,3 +115,25 @@ def warn_of_outputs(scope: Scope) -> None:
         if output.discovery is not None and not output.retain:
             message = "with it, Home Assistant has no value after a start until one changes"
             scope.report.warn((*path, "retain"), message)
+
+
+def _warn_of_influx(scope: Scope, path: KeyPath, output: InfluxConfig) -> None:
+    """Warns of names that InfluxDB does not take, or confuses. Other receivers may take them."""
+    if "time" in output.tags:
+        message = "InfluxDB refuses all points with a tag of this name"
+        scope.report.warn((*path, "tags", "time"), message)
+    fields: dict[str, str] = {}
+    for device in output.devices or scope.config.devices:
+        for tag in scope.config.tags(device):
+            if tag.of_type.count is None:  # The fields of an array have other names.
+                fields.setdefault(tag.name, device)
+    for name, device in fields.items():
+        found = f"found the tag {name} of {device}"
+        if name == "time":
+            message = f"{found}: InfluxDB stores no field of this name, its values are lost"
+            scope.report.warn(path, message)
+        elif name == "device" or name in output.tags:
+            message = (
+                f"{found}, and {name} as a tag of all points: queries of InfluxDB confuse them"
+            )
+            scope.report.warn(path, message)
