@@ -10,18 +10,19 @@ import pytest
 from holdfast.net.nats.connection import Servers
 from holdfast.outputs import Buffer, Sending
 from holdfast.outputs import sending as module
+from holdfast.outputs.sending import Refused
 from holdfast.polling.faults import NO_CONNECTION
 from holdfast.runtime.stop import Stop
 from holdfast.scanner.publish import nats_output as output_module
 from holdfast.scanner.publish.nats_output import NatsOutput
 from support import wire
+from support.brokers import NatsServer
 from support.nats_bus import Caller
 from support.readings import TIME, numbered, polls, reading, tag
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from support.brokers import NatsServer
+    from pathlib import Path
 
 STAMP = int(TIME * 1000)
 
@@ -107,6 +108,36 @@ def test_nothing_is_lost_when_the_server_is_away(
     # What came before the listener is not seen: NATS keeps nothing without a stream.
     assert found == list(range(found[0], 2004))
     assert sending.status()["readings"] == {"sent": 2004, "refused": 0, "dropped": 0}
+
+
+@pytest.mark.parametrize(
+    ("rule", "reason"),
+    [
+        (
+            'authorization: {users: [{user: u, password: "", permissions: {publish: '
+            '{deny: "modbus.data.big"}}}]}',
+            'permissions violation for publish to "modbus.data.big"',
+        ),
+        ("max_payload: 512", r"modbus.data.big: found \d+ bytes, the server takes 512"),
+    ],
+)
+def test_a_value_that_the_server_does_not_take_is_refused_alone(
+    tmp_path: Path, rule: str, reason: str
+) -> None:
+    (tmp_path / "nats.conf").write_text(rule)
+    server = NatsServer(tmp_path, "-c", str(tmp_path / "nats.conf"), jetstream=False)
+    output = NatsOutput(Servers((server.url,), user="u"), "modbus", "tentacle")
+    try:
+        big = reading([60000] * 120, tag=tag("t", type="uint16[120]"), device="big")
+        output.send([reading(1)])
+        for _ in range(3):
+            with pytest.raises(Refused, match=reason) as caught:
+                output.send([reading(1), big, reading(2)])
+            assert caught.value.count == 1
+        output.send([reading(3)])
+    finally:
+        output.close()
+        server.kill()
 
 
 def test_a_lost_connection_is_an_error_at_once(own_nats: NatsServer, output: NatsOutput) -> None:

@@ -15,7 +15,7 @@ from nats.errors import Error
 from holdfast.net.event_loop import EventLoop
 from holdfast.net.nats.connection import MAX_PENDING_BYTES, nats_reason
 from holdfast.net.nats.tolerant_client import SafeClient
-from holdfast.outputs.sending import Receiver, soon_after
+from holdfast.outputs.sending import Receiver, Refused, soon_after
 from holdfast.polling.faults import fault_text, is_exception
 from holdfast.scanner.dialects import DIALECTS
 from holdfast.scanner.messages.types import Data, Status
@@ -53,13 +53,18 @@ class NatsOutput(Receiver):
         self._lost: asyncio.Event | None = None
         """Set when the connection of the client has ended."""
         self._states: dict[str, str] = {}
+        self._refusals: list[str] = []
+        """The reason of each message that the server does not take, since the last step began."""
 
     def until(self, stop: Stop) -> None:
         """Ends a wait for the server soon after the stop. Called before all else."""
         soon_after(stop, self._end)
 
     def send(self, readings: list[Reading]) -> None:
-        """Publishes values, and states that have changed. The server has them when this returns."""
+        """Publishes values, and states that have changed. The server has them when this returns.
+
+        Raises `Refused` if there are some that it never takes.
+        """
         try:
             self._runner.run(self._send(readings))
         except (OSError, Error) as error:
@@ -91,10 +96,19 @@ class NatsOutput(Receiver):
 
     async def _send(self, readings: list[Reading]) -> None:
         client = await self._connected()
+        self._refusals = []  # Those of the connection before do not count.
         for reading in readings:
             for subject, payload in self._messages(reading):
-                await client.publish(subject, payload)
+                if len(payload) > client.max_payload:
+                    message = f"{subject}: found {len(payload)} bytes"
+                    self._refusals.append(f"{message}, the server takes {client.max_payload}")
+                else:
+                    await client.publish(subject, payload)
+        # The server tells of each message that it forbids before it confirms the step, but not of
+        # which: a state counts as the value that came with it.
         await self._confirmed(client)
+        if self._refusals:
+            raise Refused(self._refusals[0], min(len(self._refusals), len(readings)))
 
     async def _confirmed(self, client: SafeClient) -> None:
         """Waits until the server has everything. A connection that ends is an error at once."""
@@ -142,9 +156,13 @@ class NatsOutput(Receiver):
             max_reconnect_attempts=1,
             reconnect_time_wait=0,
             pending_size=MAX_PENDING_BYTES,
-            error_cb=_ignore_error,
+            error_cb=self._note_error,
             disconnected_cb=lost,
         )
+
+    async def _note_error(self, error: Exception) -> None:
+        """Notes a message that the server forbids. Any other error also ends `send`."""
+        self._refusals.append(nats_reason(error))
 
     def _close_client(self) -> None:
         client, self._client = self._client, None
@@ -178,7 +196,3 @@ class NatsOutput(Receiver):
             (f"{self._prefix}.status.{name}", payload)
             for name in self._dialect.device_names(device)
         ]
-
-
-async def _ignore_error(_: Exception) -> None:
-    """Ignores an error: it also ends `send`, which reports it."""
