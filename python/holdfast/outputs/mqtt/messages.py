@@ -108,7 +108,11 @@ class Payloads:
 
 
 def _polls(readings: list[Reading]) -> Iterator[list[Reading]]:
-    """Readings that come from one poll of one device, as far as their order and times show."""
+    """Readings that come from one poll of one device, as far as their order and times show.
+
+    Those of several polls of less than a second that waited together may share a group: what waits
+    does not know its poll.
+    """
     group: list[Reading] = []
     names: set[str] = set()
     for reading in readings:
