@@ -80,16 +80,36 @@ pub(crate) fn send(socket: &TcpStream, output: &[u8]) -> io::Result<usize> {
 pub(crate) struct ResendLimit(Duration);
 
 impl ResendLimit {
-    /// Called before a request is sent. The limit is the longest timeout so far in whole seconds, rounded up: it
-    /// seldom changes, and a device that acknowledges late is not taken for one that is gone.
+    /// Called before a request is sent. The limit is the longest timeout so far in whole seconds, rounded up, at
+    /// least 1: it seldom changes, and a device that acknowledges late is not taken for one that is gone.
     #[inline]
     pub(crate) fn cover(&mut self, socket: SockRef<'_>, timeout: Duration) {
-        if timeout > self.0 {
-            self.0 = Duration::from_secs(timeout.as_secs_f64().ceil() as u64);
+        if timeout > self.0 || self.0.is_zero() {
+            self.0 = Duration::from_secs(timeout.as_secs_f64().ceil().max(1.0) as u64);
             #[cfg(target_os = "linux")]
             let _ = socket.set_tcp_user_timeout(Some(self.0));
             #[cfg(not(target_os = "linux"))]
             let _ = socket;
+        }
+    }
+}
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_limit_is_the_longest_timeout_in_whole_seconds() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let stream = std::net::TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let socket = || SockRef::from(&stream);
+        let mut limit = ResendLimit::default();
+        for (timeout_ms, limit_s) in
+            [(0, 1), (900, 1), (1000, 1), (1001, 2), (500, 2), (60_000, 60)]
+        {
+            limit.cover(socket(), Duration::from_millis(timeout_ms));
+            let set = socket().tcp_user_timeout().unwrap();
+            assert_eq!(set, Some(Duration::from_secs(limit_s)), "{timeout_ms} ms");
         }
     }
 }

@@ -533,7 +533,7 @@ mod tests {
 
     #[cfg(target_os = "linux")]
     #[test]
-    fn the_system_repeats_no_request_for_much_longer_than_the_longest_timeout() {
+    fn the_system_repeats_no_request_for_much_longer_than_its_timeout() {
         let runtime = Builder::new_current_thread().enable_all().build().unwrap();
         LocalSet::new().block_on(&runtime, async {
             let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
@@ -548,16 +548,12 @@ mod tests {
             });
             let request = Request::WriteSingleRegister { address: 0, value: 1 };
             let write = EncodedRequest::new(&request);
-            for (timeout_ms, limit_s) in [(58_900, 59), (60_200, 61), (59_500, 61)] {
-                let timeout = Duration::from_millis(timeout_ms);
-                let pace = Pace::new(InFlight::Fixed(1));
-                let permit = Permit::default();
-                link.exchange(&pace, 1, &write, timeout, true, &permit).await.unwrap();
-                let open = link.open.borrow();
-                let socket = SockRef::from(open.as_ref().unwrap().writer.as_ref());
-                let limit = socket.tcp_user_timeout().unwrap();
-                assert_eq!(limit, Some(Duration::from_secs(limit_s)));
-            }
+            let (pace, permit) = (Pace::new(InFlight::Fixed(1)), Permit::default());
+            link.exchange(&pace, 1, &write, TIMEOUT, true, &permit).await.unwrap();
+            let open = link.open.borrow();
+            let socket = SockRef::from(open.as_ref().unwrap().writer.as_ref());
+            let limit = socket.tcp_user_timeout().unwrap();
+            assert!(limit.is_some_and(|limit| !limit.is_zero() && limit <= TIMEOUT), "{limit:?}");
             device.abort();
         });
     }

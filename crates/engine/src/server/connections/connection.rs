@@ -240,7 +240,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             }
             if self.answering.room() == 0 {
                 self.reads_in_turn = 0;
-                self.is_unaware = true;
+                (self.is_unaware, self.has_read_all) = (true, false);
                 return stream::poll_end(self.stream.socket(), context).map(Err);
             }
         }

@@ -37,7 +37,7 @@ impl From<End> for Kind {
 /// that they keep their order.
 pub(crate) trait Stream: Send {
     /// Reads once. Returns the length of received Modbus data, which can be 0. An error ends the
-    /// connection.
+    /// connection. The runtime does not limit how often it is called: a task lets others run by itself.
     fn poll_read(
         &mut self,
         context: &mut Context<'_>,
