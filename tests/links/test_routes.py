@@ -940,6 +940,25 @@ def test_a_client_that_sends_more_than_is_read_gets_all_replies(device: Stream, 
     assert replies == [3000, *range(3000)]
 
 
+def test_a_connection_that_had_no_room_reads_on_after_the_reply(device: Stream, run: Run) -> None:
+    """Requests take more room while they wait, so that the last read was a short one."""
+    held = Held()
+    device.script = [held]
+    appliance = run(configuration(device.url, kind="rtu", units=BESIDE_MEMORY, memories=MEMORY))
+    frame = TRANSPORTS["rtu"].frame
+    with client("rtu", scada(appliance)) as front:
+        assert isinstance(front, FramedConnection)
+        front.send(frame(READ) + 700 * frame(b"\x0b", unit=2))
+        device.await_requests(1)
+        front.send(frame(READ, unit=2))
+        assert pauses(front)
+        held.release()
+        replies = front.replies(702)
+
+    assert [unit for unit, _ in replies] == [1, *701 * [2]]
+    assert (replies[0][1], replies[-1][1]) == (FIVE, bytes.fromhex("03020000"))
+
+
 def test_the_write_of_a_client_that_has_gone_does_not_wait_for_late_replies(
     run: Run, connect: Connect, tmp_path: Path
 ) -> None:
