@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast.outputs import Buffer
-from holdfast.outputs.buffer import MAX_ROW
+from holdfast.outputs.buffer import MAX_ROW, FileGone
 from holdfast.outputs.buffer_file import Stored
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.tag_meaning import meaning_of
@@ -289,23 +289,68 @@ def test_a_full_disk_leaves_the_file_as_it_was(opened: Opened, tmp_path: Path) -
     assert stored.count == 0
 
 
-def test_a_removal_that_fails_changes_nothing(opened: Opened, tmp_path: Path) -> None:
-    stored = opened(tmp_path / "b.db")
-    stored.add([numbered(3)])
-    # The commit fails, because a row refers to the one that is removed.
-    stored._db.executescript(
-        "PRAGMA foreign_keys=ON;"
-        "CREATE TABLE other (id REFERENCES readings DEFERRABLE INITIALLY DEFERRED);"
-        "INSERT INTO other SELECT id FROM readings"
+def refuse_removals(stored: Stored) -> None:
+    """As on a full disk: a removal has to write a journal first."""
+    stored._db.execute(
+        "CREATE TRIGGER full BEFORE DELETE ON readings BEGIN SELECT RAISE(ABORT, 'is full'); END"
     )
-    for _ in range(2):
-        assert numbers(stored.first(1)) == [0, 1, 2]
-        with pytest.raises(OSError, match="FOREIGN KEY constraint failed"):
-            stored.remove_first()
-        assert stored.count == 3
-    stored._db.execute("DROP TABLE other")
-    stored.remove_first()
-    assert (stored.first(1), stored.count) == ([], 0)
+
+
+def test_what_can_not_be_removed_is_not_sent_again(opened: Opened, tmp_path: Path) -> None:
+    buffer = Buffer()
+    stored = buffer.stored = opened(tmp_path / "b.db")
+    for start in range(0, 9, 3):
+        stored.add([numbered(3, start)])
+    refuse_removals(stored)
+    assert numbers(buffer.take(1, 0)) == [0, 1, 2]
+    with pytest.raises(OSError, match="is full"):
+        buffer.done()
+    assert numbers(buffer.take(1, 0)) == [3, 4, 5]
+    assert len(buffer) == 6
+    stored._db.execute("DROP TRIGGER full")
+    stored.add([numbered(3, 9)])
+    assert stored._db.execute("SELECT min(id) FROM readings").fetchone() == (2,)
+    assert drained(buffer) == list(range(3, 12))
+
+
+def test_a_file_goes_as_a_whole_if_all_is_sent_and_nothing_can_be_removed(
+    opened: Opened, tmp_path: Path
+) -> None:
+    """A full disk would keep it full."""
+    buffer = Buffer()
+    buffer.stored = opened(tmp_path / "b.db")
+    buffer.offer(polls(3))
+    buffer.keep(60)
+    refuse_removals(buffer.stored)
+    assert numbers(buffer.take(3, 0)) == [0, 1, 2]
+    with pytest.raises(FileGone, match="is full"):
+        buffer.done()
+    assert list(tmp_path.iterdir()) == []
+    assert (buffer.dropped, len(buffer)) == (0, 0)
+    buffer.stored = opened(tmp_path / "b.db")
+    assert drained(buffer) == []
+
+
+def test_a_file_that_can_not_be_deleted_either_stays_open(
+    opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If it were opened anew, all of it would be sent again."""
+    buffer = Buffer()
+    stored = buffer.stored = opened(tmp_path / "b.db")
+    stored.add([numbered(3)])
+    refuse_removals(stored)
+    assert numbers(buffer.take(3, 0)) == [0, 1, 2]
+
+    def is_read_only(_: Path) -> None:
+        raise OSError("read-only file system")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(type(tmp_path), "unlink", is_read_only)
+        with pytest.raises(OSError, match="is full"):
+            buffer.done()
+    assert buffer.stored is stored
+    buffer.offer(polls(1, 3))
+    assert drained(buffer) == [3]
 
 
 def test_an_empty_file_is_small(opened: Opened, tmp_path: Path) -> None:

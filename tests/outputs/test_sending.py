@@ -13,7 +13,7 @@ from holdfast.outputs import sending as module
 from holdfast.outputs.buffer_file import Stored
 from holdfast.runtime.stop import Stop
 from support import wire
-from support.readings import numbers, polls, tag
+from support.readings import numbered, numbers, polls, tag
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -366,5 +366,37 @@ def test_a_file_that_can_not_be_opened_stops_nothing(
     (tmp_path / "missing").mkdir()
     output.buffer.offer(polls(1, 3))
     wire.until(lambda: output.sending.status()["file_error"] is None, "the file is opened")
+    output.end()
+    assert count(caplog, "output_file_failed") == 1
+
+
+def test_a_file_from_which_nothing_can_be_removed_stops_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As on a full disk. Nothing is sent twice."""
+    file = tmp_path / "b.db"
+    stored = Stored(file, 2**30, lambda *_: tag())
+    for start in range(0, 5000, 500):
+        stored.add([numbered(500, start)])
+    stored._db.execute(
+        "CREATE TRIGGER full BEFORE DELETE ON readings BEGIN SELECT RAISE(ABORT, 'is full'); END"
+    )
+    stored.close()
+    output = Running(file)
+    output.buffer.offer(polls(5, 5000))
+    wire.until(lambda: len(output.receiver.sent) >= 5005, "all is sent")
+    wire.until(lambda: output.sending.status()["file_error"] is None, "there is a new file")
+    output.end()
+    assert output.receiver.sent == list(range(5005))
+    assert (count(caplog, "output_file_failed"), count(caplog, "output_failed")) == (1, 0)
+
+
+def test_a_file_that_fails_is_logged_once_in_an_outage(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    output = Running(tmp_path / "missing" / "b.db")
+    output.receiver.error = OSError("down")
+    output.buffer.offer(polls(3))
+    wire.until(lambda: output.receiver.attempts > 3, "it is tried again")
     output.end()
     assert count(caplog, "output_file_failed") == 1

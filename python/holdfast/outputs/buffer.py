@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 from holdfast.config.models.outputs import MAX_VALUES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from holdfast.outputs.buffer_file import Stored
     from holdfast.polling import Reading
@@ -21,6 +22,17 @@ MAX_STEP = 20_000
 
 MAX_ROW = 1000
 """Readings in one row of the file, but for the rest of a poll."""
+
+
+class FileGone(OSError):
+    """The file could not be used any more, and is closed: another can be opened in its place.
+
+    `lost` readings waited in it.
+    """
+
+    def __init__(self, message: str, lost: int) -> None:
+        super().__init__(message)
+        self.lost = lost
 
 
 class Buffer:
@@ -83,7 +95,8 @@ class Buffer:
             return self._batch
         # The readings in the file are older than those in memory.
         if self.stored is not None and self.stored.count:
-            self._batch = self.stored.first(max_readings)
+            with self._losing_file():
+                self._batch = self.stored.first(max_readings)
             self._is_batch_stored = bool(self._batch)
             self.dropped += self.stored.damaged
             self.stored.damaged = 0
@@ -114,11 +127,17 @@ class Buffer:
             self._seen = self._offered
         return is_late
 
-    def done(self) -> None:
-        """Removes the readings that `take` returned. Raises `OSError` if the file fails."""
-        if self._is_batch_stored and self.stored is not None:
-            self.stored.remove_first()
-        self._batch, self._is_batch_stored = [], False
+    def done(self) -> bool:
+        """Removes the readings that `take` returned. Returns whether they were in the file.
+
+        Raises `OSError` if the file fails. Even then, `take` does not return them again.
+        """
+        was_stored, self._batch, self._is_batch_stored = self._is_batch_stored, [], False
+        if was_stored:
+            assert self.stored is not None, "the batch is in it"
+            with self._losing_file():
+                self.stored.remove_first()
+        return was_stored
 
     def wake(self) -> None:
         """Ends the current or the next wait of `take`. Thread-safe."""
@@ -126,14 +145,17 @@ class Buffer:
             self._is_woken = True
             self._changed.notify_all()
 
-    def keep(self, seconds: float, step: int = MAX_STEP) -> None:
-        """Moves what waits in memory now to the file, if there is one, `step` at a time.
+    def keep(self, seconds: float, step: int = MAX_STEP) -> bool:
+        """Moves what waits in memory now to the file, if there is one, `step` at a time. Returns
+        whether anything was moved.
 
         Ends after some seconds, and does not wait for readings that come meanwhile: they may come
-        faster than a disk stores them. Raises `OSError` if the file fails. No reading is lost then.
+        faster than a disk stores them. Raises `OSError` if the file fails. No reading of those in
+        memory is lost then.
         """
+        has_moved = False
         if self.stored is None:
-            return
+            return has_moved
         until = time.monotonic() + seconds
         with self._changed:
             left = self._count
@@ -148,15 +170,28 @@ class Buffer:
                         rows.append(row)
                         left -= len(row)
             if not rows:
-                return
+                return has_moved
             try:
-                self.dropped += self.stored.add(rows)
+                with self._losing_file():
+                    self.dropped += self.stored.add(rows)
             except BaseException:
                 if rows[0] is not self._batch:
                     self._put_back(*rows)
                 raise
+            has_moved = True
             if rows[0] is self._batch:
                 self._batch = []
+        return has_moved
+
+    @contextlib.contextmanager
+    def _losing_file(self) -> Iterator[None]:
+        """Goes on without a file that is gone. A batch that came from it is in memory only."""
+        try:
+            yield
+        except FileGone as gone:
+            self.dropped += gone.lost
+            self.stored, self._is_batch_stored = None, False
+            raise
 
     def _put_back(self, *rows: list[Reading]) -> None:
         with self._changed:

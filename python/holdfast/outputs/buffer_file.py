@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from holdfast.outputs.buffer import FileGone
 from holdfast.outputs.tag_meaning import described, meaning_of, tag_from
 from holdfast.polling import Reading
 from holdfast.tags import Tag
@@ -48,7 +49,7 @@ class Stored:
     ) -> None:
         self.file = file
         self.count = 0
-        """How many readings there are."""
+        """How many readings wait."""
         self.damaged = 0
         """How many readings were removed because they could not be read."""
         self._max_bytes, self._find = max_bytes, find
@@ -57,8 +58,10 @@ class Stored:
         """The meanings that are in the file for sure."""
         self._earlier: dict[tuple[str, int], Tag] = {}
         """Tags as they were when their readings were stored."""
-        self._last = 0
-        """The last row that `first` returned."""
+        self._first: dict[int, int] = {}
+        """The rows that `first` returned last, and how many readings each has."""
+        self._sent = 0
+        """The last row that is sent. On a full disk, rows up to it are still in the file."""
         with file_errors(file):
             self._db = sqlite3.connect(
                 file, timeout=lock_timeout, isolation_level=None, check_same_thread=False
@@ -92,9 +95,8 @@ class Stored:
             )
             for row in rows
         ]
-        # The rollback may undo what is counted here.
-        with file_errors(self.file, self._recount), self._db:
-            self._db.execute("BEGIN")
+        with self._transaction():
+            self._remove("id <= ?", self._sent)
             self._db.executemany("INSERT OR IGNORE INTO tags VALUES (?, ?)", new.items())
             for count, data in zip(map(len, rows), encoded, strict=True):
                 while self._bytes + len(data) > self._max_bytes and self.count:
@@ -116,12 +118,13 @@ class Stored:
         """
         query = "SELECT id, data, count FROM readings WHERE id > ? ORDER BY id LIMIT 1"
         found: list[Reading] = []
-        self._last = 0
+        last = self._sent
+        self._first = {}
         while True:
             with file_errors(self.file):
-                row = self._db.execute(query, (self._last,)).fetchone()
+                row = self._db.execute(query, (last,)).fetchone()
             if row is None and not found:
-                self.count = self._bytes = 0
+                self._recount()
             if row is None or (found and len(found) + row[2] > most):
                 return found
             id, data, count = row
@@ -130,18 +133,35 @@ class Stored:
             except (msgspec.MsgspecError, TypeError, ValueError):
                 if found:
                     return found
-                self._last = id
-                self.remove_first()
+                last, self._first = id, {id: count}
                 self.damaged += count
+                self.remove_first()
             else:
                 found += readings
-                self._last = id
+                last, self._first[id] = id, count
 
     def remove_first(self) -> None:
-        """Removes what `first` returned last, unless `add` has dropped it since."""
-        with file_errors(self.file, self._recount), self._db:
-            self._db.execute("BEGIN")
-            self._remove("id <= ?", self._last)
+        """Removes what `first` returned last, unless `add` has dropped it since.
+
+        If that fails, this or `add` removes it later; `first` goes on behind it all the same.
+        """
+        self.count -= sum(self._first.values())
+        self._sent = max(self._first, default=self._sent)
+        self._first = {}
+        try:
+            with self._transaction():
+                self._remove("id <= ?", self._sent)
+        except OSError as error:
+            if self.count:
+                raise
+            # A removal needs room for its journal, which a full disk does not have. A file in which
+            # nothing waits can go as a whole, unless the disk can only be read.
+            try:
+                self.file.unlink()
+            except OSError:
+                raise error from None
+            self.close()
+            raise FileGone(str(error), self.damaged) from error
         if not self.count:
             # The readings are removed already. If this fails, pages stay free for the next ones.
             with contextlib.suppress(sqlite3.Error):
@@ -154,16 +174,36 @@ class Stored:
 
     def _remove(self, which: str, *parameters: int) -> int:
         rows = self._db.execute(
-            f"DELETE FROM readings WHERE {which} RETURNING count, length(data)", parameters
+            f"DELETE FROM readings WHERE {which} RETURNING id, count, length(data)", parameters
         ).fetchall()
-        removed = sum(count for count, _ in rows)
+        removed = 0
+        for id, count, size in rows:
+            self._bytes -= size
+            if id > self._sent:
+                removed += count
+                self._first.pop(id, None)
         self.count -= removed
-        self._bytes -= sum(size for _, size in rows)
-        return int(removed)
+        return removed
 
     def _recount(self) -> None:
-        query = "SELECT coalesce(sum(count), 0), coalesce(sum(length(data)), 0) FROM readings"
-        self.count, self._bytes = self._db.execute(query).fetchone()
+        query = (
+            "SELECT coalesce(sum(count) FILTER (WHERE id > ?), 0), coalesce(sum(length(data)), 0) "
+            "FROM readings"
+        )
+        with file_errors(self.file):
+            self.count, self._bytes = self._db.execute(query, (self._sent,)).fetchone()
+
+    @contextlib.contextmanager
+    def _transaction(self) -> Iterator[None]:
+        """All that is done, or none of it, also of what is counted."""
+        before = self.count, self._bytes, self._first.copy()
+        try:
+            with file_errors(self.file), self._db:
+                self._db.execute("BEGIN")
+                yield
+        except BaseException:
+            self.count, self._bytes, self._first = before
+            raise
 
     def _reading(
         self,

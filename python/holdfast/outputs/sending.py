@@ -10,6 +10,7 @@ from math import inf
 from typing import TYPE_CHECKING, Protocol
 
 from holdfast.events import log_lines
+from holdfast.outputs.buffer import FileGone
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
@@ -166,7 +167,7 @@ class Sending:
     def _step(self, stop: Stop) -> bool:
         """Sends once. Returns whether to go on at once."""
         try:
-            readings = self._buffer.take(MAX_READINGS, 0.0 if stop.is_set() else CHECK_INTERVAL_S)
+            readings = self._take(0.0 if stop.is_set() else CHECK_INTERVAL_S)
             if not readings:
                 if self._receiver.idle():
                     self._worked(0)
@@ -178,11 +179,20 @@ class Sending:
         except OSError as error:
             return self._failed(error)
         self._worked(len(self._buffer) - len(readings))
-        try:
-            self._buffer.done()
-        except OSError as error:
-            return self._failed(error)
+        self._done()
         return True
+
+    def _take(self, seconds: float) -> list[Reading]:
+        """The oldest readings; those in memory, if the file is gone. Raises `OSError`."""
+        with self._using_file(FileGone):
+            return self._buffer.take(MAX_READINGS, seconds)
+        return self._buffer.take(MAX_READINGS, seconds)
+
+    def _done(self) -> None:
+        """Removes what was sent. If the file fails, the next readings are sent all the same."""
+        with self._using_file():
+            if self._buffer.done():
+                self._file_error = None
 
     def _worked(self, waiting: int) -> None:
         """Notes that the receiver works; so many readings wait for it."""
@@ -242,10 +252,10 @@ class Sending:
         if not self._is_failing:
             while len(self._buffer) and time.monotonic() < end:
                 try:
-                    self._send(self._buffer.take(MAX_READINGS, 0.0))
-                    self._buffer.done()
+                    self._send(self._take(0.0))
                 except OSError:
                     break
+                self._done()
         self._keep(STORE_TIMEOUT_S)
         self._log_dropped(0.0)
         self._log_unsent()
@@ -262,10 +272,12 @@ class Sending:
             return
         with self._using_file():
             self._buffer.stored = self._open_file()
+            self._file_error = None
 
     def _keep(self, seconds: float) -> None:
         with self._using_file():
-            self._buffer.keep(seconds)
+            if self._buffer.keep(seconds):
+                self._file_error = None
 
     def _log_dropped(self, every: float = DROPPED_INTERVAL_S) -> None:
         """Logs how many readings were lost because there was no room, once in some seconds."""
@@ -286,16 +298,14 @@ class Sending:
             )
 
     @contextlib.contextmanager
-    def _using_file(self) -> Iterator[None]:
+    def _using_file(self, errors: type[OSError] = OSError) -> Iterator[None]:
         # No error of the file stops the output. Each new one is logged once.
         try:
             yield
-        except OSError as error:
+        except errors as error:
             message = str(error)
             if message != self._file_error:
                 log_lines.write(
                     logging.ERROR, "output_file_failed", output=self._name, error=message
                 )
             self._file_error = message
-        else:
-            self._file_error = None
