@@ -256,6 +256,74 @@ def test_a_file_that_is_no_database_is_an_error(opened: Opened, tmp_path: Path) 
         opened(tmp_path / "b.db")
 
 
+def damage(file: Path, page: int) -> None:
+    """Overwrites one page, as a worn card or a power cut may."""
+    with file.open("r+b") as opened:
+        opened.seek(4096 * (page - 1))
+        opened.write(b"\xa5" * 4096)
+
+
+def test_a_damaged_file_is_left_under_another_name(opened: Opened, tmp_path: Path) -> None:
+    """What is before the damage is sent, and the rest dropped."""
+    file = tmp_path / "b.db"
+    stored = opened(file)
+    for start in range(0, 5000, 1000):
+        stored.add([numbered(1000, start)])
+    [pages] = stored._db.execute("PRAGMA page_count").fetchone()
+    stored.close()
+    damage(file, pages // 2)
+    buffer = Buffer()
+    buffer.stored = opened(file)
+    found: list[int] = []
+    with pytest.raises(FileGone, match=r"b\.db: .*malformed; it is .*b\.db\.damaged now"):  # noqa: PT012
+        while readings := buffer.take(1000, 0):
+            found += numbers(readings)
+            buffer.done()
+    assert 0 < len(found) < 5000
+    assert found == list(range(len(found)))
+    assert (buffer.dropped, len(buffer)) == (5000 - len(found), 0)
+    assert [each.name for each in tmp_path.iterdir()] == ["b.db.damaged"]
+
+
+def test_what_was_taken_from_a_damaged_file_is_not_lost(opened: Opened, tmp_path: Path) -> None:
+    """A new file takes it, with what came since."""
+    file = tmp_path / "b.db"
+    stored = opened(file)
+    stored.add([numbered(3)])
+    stored.add([numbered(3, 3)])
+    [page] = stored._db.execute("SELECT rootpage FROM sqlite_master WHERE name = 'tags'").fetchone()
+    stored.close()
+    damage(file, page)
+    buffer = Buffer()
+    buffer.stored = opened(file)
+    assert numbers(buffer.take(3, 0)) == [0, 1, 2]
+    buffer.offer(polls(1, 6))
+    with pytest.raises(FileGone, match="malformed"):
+        buffer.keep(60)
+    assert (buffer.dropped, len(buffer)) == (3, 4)
+    stored = buffer.stored = opened(file)
+    buffer.keep(60)
+    assert stored.count == 4
+    assert drained(buffer) == [0, 1, 2, 6]
+
+
+def test_a_file_that_is_damaged_at_the_start_is_left_under_another_name(
+    opened: Opened, tmp_path: Path
+) -> None:
+    file = tmp_path / "b.db"
+    stored = opened(file)
+    stored.add([numbered(3)])
+    [page] = stored._db.execute(
+        "SELECT rootpage FROM sqlite_master WHERE name = 'readings'"
+    ).fetchone()
+    stored.close()
+    damage(file, page)
+    with pytest.raises(FileGone, match="malformed"):
+        opened(file)
+    assert opened(file).count == 0
+    assert (tmp_path / "b.db.damaged").exists()
+
+
 @pytest.mark.parametrize("error", [OSError, RuntimeError])
 def test_what_can_not_be_stored_stays_in_memory(
     opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]

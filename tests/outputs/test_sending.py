@@ -391,6 +391,26 @@ def test_a_file_from_which_nothing_can_be_removed_stops_nothing(
     assert (count(caplog, "output_file_failed"), count(caplog, "output_failed")) == (1, 0)
 
 
+def test_a_damaged_file_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file = tmp_path / "b.db"
+    stored = Stored(file, 2**30, lambda *_: tag())
+    for start in range(0, 5000, 1000):
+        stored.add([numbered(1000, start)])
+    [pages] = stored._db.execute("PRAGMA page_count").fetchone()
+    stored.close()
+    with file.open("r+b") as damaged:
+        damaged.seek(4096 * (pages // 2 - 1))
+        damaged.write(b"\xa5" * 4096)
+    output = Running(file)
+    wire.until(lambda: output.buffer.dropped, "the rest of the file is lost")
+    output.buffer.offer(polls(5, 5000))
+    wire.until(lambda: output.receiver.sent[-5:] == list(range(5000, 5005)), "all is sent")
+    output.end()
+    assert len(output.receiver.sent) + output.buffer.dropped == 5005
+    assert count(caplog, "output_file_failed") == count(caplog, "output_dropped") == 1
+    assert count(caplog, "output_failed") == 0
+
+
 def test_a_file_that_fails_is_logged_once_in_an_outage(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -66,7 +66,7 @@ class Stored:
             self._db = sqlite3.connect(
                 file, timeout=lock_timeout, isolation_level=None, check_same_thread=False
             )
-        with file_errors(file, self.close):
+        with self._errors(self.close):
             # Two processes with one file would each send the readings of the other.
             self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
@@ -121,15 +121,19 @@ class Stored:
         last = self._sent
         self._first = {}
         while True:
-            with file_errors(self.file):
-                row = self._db.execute(query, (last,)).fetchone()
-            if row is None and not found:
-                self._recount()
-            if row is None or (found and len(found) + row[2] > most):
-                return found
-            id, data, count = row
             try:
+                row = self._db.execute(query, (last,)).fetchone()
+                if row is None and not found:
+                    self._recount()
+                if row is None or (found and len(found) + row[2] > most):
+                    return found
+                id, data, count = row
                 readings = [self._reading(*plain) for plain in _decoded(data)]
+            except sqlite3.Error:
+                if found:
+                    return found
+                with self._errors():
+                    raise
             except (msgspec.MsgspecError, TypeError, ValueError):
                 if found:
                     return found
@@ -151,6 +155,8 @@ class Stored:
         try:
             with self._transaction():
                 self._remove("id <= ?", self._sent)
+        except FileGone:
+            raise
         except OSError as error:
             if self.count:
                 raise
@@ -190,7 +196,7 @@ class Stored:
             "SELECT coalesce(sum(count) FILTER (WHERE id > ?), 0), coalesce(sum(length(data)), 0) "
             "FROM readings"
         )
-        with file_errors(self.file):
+        with self._errors():
             self.count, self._bytes = self._db.execute(query, (self._sent,)).fetchone()
 
     @contextlib.contextmanager
@@ -198,12 +204,32 @@ class Stored:
         """All that is done, or none of it, also of what is counted."""
         before = self.count, self._bytes, self._first.copy()
         try:
-            with file_errors(self.file), self._db:
+            with self._errors(), self._db:
                 self._db.execute("BEGIN")
                 yield
         except BaseException:
             self.count, self._bytes, self._first = before
             raise
+
+    @contextlib.contextmanager
+    def _errors(self, undo: Callable[[], object] = lambda: None) -> Iterator[None]:
+        """As `file_errors`, but a damaged file is `FileGone`, and left under another name."""
+        waiting = self.count - sum(self._first.values()) + self.damaged
+        try:
+            with file_errors(self.file, undo):
+                yield
+        except OSError as error:
+            # Errors of the module itself have no code.
+            code = getattr(error.__cause__, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
+            if code & 0xFF != sqlite3.SQLITE_CORRUPT:
+                raise
+            self.close()
+            aside = self.file.with_name(f"{self.file.name}.damaged")
+            try:
+                self.file.replace(aside)
+            except OSError as failed:
+                raise FileGone(f"{error}; it can't become {aside}: {failed}", 0) from error
+            raise FileGone(f"{error}; it is {aside} now", waiting) from error
 
     def _reading(
         self,
@@ -225,8 +251,7 @@ class Stored:
         if (known := self._earlier.get((name, meaning))) is not None:
             return known
         query = "SELECT description FROM tags WHERE meaning = ?"
-        with file_errors(self.file):
-            row = self._db.execute(query, (meaning,)).fetchone()
+        row = self._db.execute(query, (meaning,)).fetchone()
         if row is None:
             return None
         return self._earlier.setdefault((name, meaning), tag_from(name, row[0]))
