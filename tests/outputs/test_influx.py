@@ -24,8 +24,10 @@ from support.line_protocol import Point, parsed
 from support.readings import numbered, polls, reading, tag
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
+
+    from holdfast.polling import Reading
 
 
 class Database(ThreadingHTTPServer):
@@ -38,6 +40,9 @@ class Database(ThreadingHTTPServer):
         self.connections = 0
         self.status, self.answer = 204, b""
         self.closes = self.says_so = False
+        self.max_bytes = 1 << 30
+        self.unwanted: set[str] = set()
+        """Fields with which a request is refused as a whole."""
 
     @property
     def url(self) -> str:
@@ -57,9 +62,14 @@ class Handler(BaseHTTPRequestHandler):
         if self.headers.get("Content-Encoding") == "gzip":
             body = gzip.decompress(body)
         self.server.requests.append((self.path, dict(self.headers)))
-        if self.server.status == 204:
-            self.server.points += parsed(body)
-        self.send_response(self.server.status)
+        points, status = parsed(body), self.server.status
+        if len(body) > self.server.max_bytes:
+            status = 413
+        elif any(self.server.unwanted & point.fields.keys() for point in points):
+            status = 400
+        if status == 204:
+            self.server.points += points
+        self.send_response(status)
         self.send_header("Content-Length", str(len(self.server.answer)))
         if self.server.says_so:
             self.send_header("Connection", "close")
@@ -165,6 +175,69 @@ def test_what_is_not_taken_says_why(
     output.send(numbered(1))
     output.close()
     assert len(database.points) == 1
+
+
+def test_what_is_too_large_is_sent_in_parts(database: Database) -> None:
+    database.max_bytes = 200
+    output = influx(database.url, bucket="b")
+    output.send(numbered(100))
+    assert [point.fields["t"] for point in database.points] == list(range(100))
+    text = reading("x" * 300, tag=tag("text", type="string:150"))
+    with pytest.raises(Refused, match="HTTP 413") as caught:
+        output.send([*numbered(9, 100), text, *numbered(9, 109)])
+    output.close()
+    assert caught.value.readings == [text]
+    assert [point.fields["t"] for point in database.points] == list(range(118))
+
+
+def of_tags(names: Iterable[str], at: int) -> list[Reading]:
+    return [reading(at, 1.0 * at, tag=tag(name)) for name in names]
+
+
+def test_a_value_that_is_not_taken_takes_no_other_with_it(database: Database) -> None:
+    names = [f"t{number}" for number in range(500)]
+    database.unwanted = {"t7", "t300"}
+    output = influx(database.url, bucket="b")
+    readings = [*of_tags(names, 1), *of_tags(names, 2)]
+
+    def wanted() -> set[tuple[str, int]]:
+        return {(name, at) for name in names if name not in database.unwanted for at in (1, 2)}
+
+    with pytest.raises(Refused, match="HTTP 400") as caught:
+        output.send(readings)
+    assert {each.name for each in caught.value.readings} == database.unwanted
+    assert len(caught.value.readings) == 4
+    found = [(name, value) for each in database.points for name, value in each.fields.items()]
+    assert set(found) == wanted()
+    assert len(found) == len(wanted())
+    # From now on, they are sent by themselves: two requests for each of them, and one for the rest.
+    database.requests.clear()
+    with pytest.raises(Refused):
+        output.send(readings)
+    assert len(database.requests) == 4
+    database.unwanted = {"t7"}
+    with pytest.raises(Refused) as caught:
+        output.send(readings)
+    assert {each.name for each in caught.value.readings} == {"t7"}
+    database.unwanted = set()
+    output.send(readings)
+    database.requests.clear()
+    output.send(readings)
+    assert len(database.requests) == 1
+    output.close()
+
+
+def test_a_receiver_that_takes_nothing_gets_few_requests(database: Database) -> None:
+    database.status = 400
+    output = influx(database.url, bucket="b")
+    readings = of_tags([f"t{number}" for number in range(1000)], 1)
+    for _ in range(3):
+        database.requests.clear()
+        with pytest.raises(Refused) as caught:
+            output.send(readings)
+        assert {each.name for each in caught.value.readings} == {each.name for each in readings}
+        assert len(database.requests) < 70
+    output.close()
 
 
 @pytest.mark.parametrize("says_so", [False, True])

@@ -189,7 +189,7 @@ def test_a_receiver_that_connects_without_readings_works_again(
 def test_what_is_refused_is_counted_and_not_tried_again(
     output: Running, caplog: pytest.LogCaptureFixture
 ) -> None:
-    output.receiver.error = Refused("HTTP 400")
+    output.receiver.error = Refused("HTTP 400", numbered(3))
     output.buffer.offer(polls(3))
     wire.until(lambda: refused(output) == 3, "it is refused")
     output.receiver.error = None
@@ -199,7 +199,7 @@ def test_what_is_refused_is_counted_and_not_tried_again(
 
 
 def test_of_a_step_that_is_refused_in_part_the_rest_counts_as_sent(output: Running) -> None:
-    output.receiver.error = Refused("of another type", 1)
+    output.receiver.error = Refused("of another type", numbered(1))
     output.buffer.offer(polls(3))
     wire.until(lambda: refused(output) == 1, "it is refused")
     counted = output.sending.status()["readings"]
@@ -211,7 +211,7 @@ def test_what_is_refused_at_the_end_is_not_kept(tmp_path: Path) -> None:
     output.end()
     output.buffer.offer(polls(3))
     output.buffer.stored = Stored(tmp_path / "b.db", 2**30, lambda *_: tag())
-    output.receiver.error = Refused("HTTP 400")
+    output.receiver.error = Refused("HTTP 400", numbered(3))
     output.sending._finish(inf)
     assert (refused(output), len(output.buffer)) == (3, 0)
     output.buffer.detach()

@@ -31,9 +31,15 @@ MAX_RESPONSE_BYTES = 65_536
 MAX_SHOWN_CHARS = 200
 """The characters of an error message of the receiver that are shown."""
 
-UNWANTED = (400, 413, 422)
+TOO_LARGE = 413
+
+UNWANTED = (400, TOO_LARGE, 422)
 """Answers to a request that would be refused each time. All others are tried again: a token or a
 bucket can be put right."""
+
+MAX_PARTINGS = 30
+"""How often one call of `send` parts what is refused for its values, in search of the tags. About
+three are found among a thousand at a time."""
 
 
 class Influx(Receiver):
@@ -44,6 +50,8 @@ class Influx(Receiver):
         self._target = settings.target
         self._connection: http.client.HTTPConnection | None = None
         self._has_ended = self._is_late = False
+        self._refused: set[tuple[str, str]] = set()
+        """Devices and tags whose last values were refused, each by itself."""
         self._path = self._target.path
         if self._path in ("", "/"):
             query = {"org": settings.org, "bucket": settings.bucket, "precision": "ns"}
@@ -55,17 +63,51 @@ class Influx(Receiver):
         soon_after(stop, self._end)
 
     def send(self, readings: list[Reading]) -> None:
-        """Sends all values in one request; those without a value are left out."""
+        """Sends all values, in one request if it is taken; those without a value are left out.
+
+        Raises `Refused` for those that the receiver does not take by themselves. One value can have
+        a whole request refused, or all its line, and how much of it no answer tells for sure.
+        """
+        waiting = [readings]
+        if self._refused:
+            waiting = [
+                [reading for reading in readings if _tag(reading) in self._refused],
+                [reading for reading in readings if _tag(reading) not in self._refused],
+            ]
+        refused: list[Reading] = []
+        reason, partings = "", 0
+        while waiting:
+            part = waiting.pop()
+            status, message = self._sent(part)
+            if status not in UNWANTED:
+                if self._refused:
+                    self._refused.difference_update(map(_tag, part))
+                continue
+            reason = message
+            by_size = status == TOO_LARGE
+            halves = _halves(part, by_size=by_size)
+            if all(halves) and (by_size or partings < MAX_PARTINGS):
+                partings += not by_size
+                waiting += halves
+                continue
+            refused += part
+            if not all(halves):
+                self._refused.add(_tag(part[0]))
+        if refused:
+            raise Refused(reason, refused)
+
+    def _sent(self, readings: list[Reading]) -> tuple[int, str]:
+        """Sends one request. Returns its status, and what says so. Raises `OSError` for a status
+        that is neither good nor `UNWANTED`.
+        """
         body = lines(readings, self._settings.measurement, self._settings.tags)
         if not body:
-            return
+            return 204, ""
         status, answer = self._answer(body)
-        if 200 <= status < 300:
-            return
         text = answer.decode("utf-8", "replace").strip()[:MAX_SHOWN_CHARS]
         message = f"{self._at}: HTTP {status}{': ' if text else ''}{text}"
-        if status in UNWANTED:
-            raise Refused(message)
+        if 200 <= status < 300 or status in UNWANTED:
+            return status, message
         raise OSError(message)
 
     def close(self) -> None:
@@ -167,3 +209,22 @@ class Influx(Receiver):
             pair = f"{settings.username}:{read_secret(settings.password_file).strip()}"
             return {"Authorization": f"Basic {base64.b64encode(pair.encode()).decode()}"}
         return {}
+
+
+def _tag(reading: Reading) -> tuple[str, str]:
+    return reading.device, reading.tag.name
+
+
+def _halves(readings: list[Reading], *, by_size: bool) -> tuple[list[Reading], list[Reading]]:
+    """The second and the first half of readings: by their number, or by their tags. One is empty if
+    there is nothing to part.
+    """
+    if by_size:
+        middle = len(readings) // 2
+        return readings[middle:], readings[:middle]
+    tags = list(dict.fromkeys(map(_tag, readings)))
+    first = set(tags[: len(tags) // 2])
+    return (
+        [reading for reading in readings if _tag(reading) not in first],
+        [reading for reading in readings if _tag(reading) in first],
+    )

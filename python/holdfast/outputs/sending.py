@@ -14,7 +14,7 @@ from holdfast.outputs.buffer import FileGone
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from holdfast.outputs.buffer import Buffer
     from holdfast.outputs.buffer_file import Stored
@@ -42,14 +42,11 @@ STORE_TIMEOUT_S = 2.5
 
 
 class Refused(Exception):
-    """The receiver refused readings for good. They are dropped and counted.
+    """The receiver refused these readings for good, and took all others. They are dropped."""
 
-    With `count`, it refused only that many, and the others were sent.
-    """
-
-    def __init__(self, message: str, count: int | None = None) -> None:
+    def __init__(self, message: str, readings: Sequence[Reading]) -> None:
         super().__init__(message)
-        self.count = count
+        self.readings = readings
 
 
 class Receiver(Protocol):
@@ -207,7 +204,7 @@ class Sending:
         try:
             self._receiver.send(readings)
         except Refused as error:
-            refused = len(readings) if error.count is None else error.count
+            refused = len(error.readings)
             log_lines.refused(
                 "output_refused",
                 kind=self._name,

@@ -73,7 +73,7 @@ class EdgeNode:
         self._aliases = itertools.count(random.SystemRandom().randrange(1, MAX_FIRST_ALIAS))
         self._devices: dict[str, DeviceMetrics] = {}
         self._alive: set[str] = set()
-        self.unfit = 0
+        self.unfit: list[Reading] = []
         """The readings that the last `data` left out: they are of an earlier form of their tag."""
 
     def begin(self) -> None:
@@ -150,7 +150,7 @@ class EdgeNode:
         latest: Latest,
     ) -> Iterator[Message]:
         """DDATA of readings. A device that does not answer is born for values that had to wait."""
-        self.unfit = 0
+        self.unfit = []
         open_payloads: dict[str, tuple[Any, set[str]]] = {}
         for reading in readings:
             device = self._devices.get(reading.device)
@@ -168,7 +168,7 @@ class EdgeNode:
             if device.add(payload, reading):
                 names.add(reading.tag.name)
             else:
-                self.unfit += 1
+                self.unfit.append(reading)
         for name, (payload, _) in open_payloads.items():
             if payload.metrics:
                 yield self._ddata(name, payload)
