@@ -58,6 +58,8 @@ def test_devices_and_tags_are_told_apart() -> None:
     assert changes.of(readings) == readings[:3]
     changes.forget(["other"])
     assert changes.of(readings) == [readings[1]]
+    changes.forget_tags([("pump", "u"), ("gone", "u")])
+    assert changes.of(readings) == [readings[2]]
 
 
 def test_every_reading_of_a_scan_is_published() -> None:

@@ -16,7 +16,7 @@ from support import wire
 from support.readings import numbered, numbers, polls, tag
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Collection, Iterator
     from pathlib import Path
 
     from holdfast.polling import Reading
@@ -54,10 +54,13 @@ class Running:
         self.open_file: Callable[[], Stored] | None = None
         if file is not None:
             self.open_file = lambda: Stored(file, 2**30, lambda *_: tag())
+        self.renewed: list[Collection[tuple[str, str]] | None] = []
         self.start()
 
     def start(self) -> None:
-        self.sending = Sending("out", self.receiver, self.buffer, self.open_file)
+        self.sending = Sending(
+            "out", self.receiver, self.buffer, self.open_file, renew=self.renewed.append
+        )
         self.thread = threading.Thread(target=self.sending.run, args=[self.stop])
         self.thread.start()
 
@@ -204,6 +207,37 @@ def test_of_a_step_that_is_refused_in_part_the_rest_counts_as_sent(output: Runni
     wire.until(lambda: refused(output) == 1, "it is refused")
     counted = output.sending.status()["readings"]
     assert counted == {"sent": 2, "refused": 1, "dropped": 0}
+
+
+def test_what_was_refused_is_replaced_now_and_then(
+    output: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At once, but not again at each poll if that is refused too."""
+    output.receiver.error = Refused("of another type", numbered(1))
+    output.buffer.offer(polls(2))
+    wire.until(lambda: output.renewed == [{("pump", "t")}], "it is replaced")
+    output.buffer.offer(polls(2))
+    wire.until(lambda: refused(output) == 2, "it is refused again")
+    output.buffer.offer(polls(2))
+    wire.until(lambda: refused(output) == 3, "it is refused once more")
+    assert len(output.renewed) == 1
+    monkeypatch.setattr(module, "RENEWAL_INTERVAL_S", 0.0)
+    wire.until(lambda: len(output.renewed) == 2, "it is replaced again")
+    output.receiver.error = None
+    output.buffer.offer(polls(2))
+    wire.until(lambda: output.receiver.sent, "all is taken")
+    assert len(output.renewed) == 2
+
+
+def test_what_was_dropped_is_replaced_when_the_receiver_works(output: Running) -> None:
+    output.receiver.error = OSError("down")
+    output.buffer.most = 2
+    output.buffer.offer(polls(5))
+    wire.until(lambda: output.receiver.attempts > 3, "it is tried again")
+    assert output.buffer.dropped == 3
+    assert output.renewed == []
+    output.receiver.error = None
+    wire.until(lambda: output.renewed == [None], "all is replaced")
 
 
 def test_what_is_refused_at_the_end_is_not_kept(tmp_path: Path) -> None:

@@ -48,3 +48,8 @@ class Changes:
         """Forgets the last values of these devices, so that their next readings are published."""
         forgotten = set(devices)
         self._last = {key: last for key, last in self._last.items() if key[0] not in forgotten}
+
+    def forget_tags(self, tags: Iterable[tuple[str, str]]) -> None:
+        """Does the same for single tags of devices."""
+        for key in tags:
+            self._last.pop(key, None)

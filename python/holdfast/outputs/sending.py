@@ -14,7 +14,7 @@ from holdfast.outputs.buffer import FileGone
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from holdfast.outputs.buffer import Buffer
     from holdfast.outputs.buffer_file import Stored
@@ -33,6 +33,9 @@ CHECK_INTERVAL_S = 1.0
 
 DROPPED_INTERVAL_S = 60.0
 """Interval of logging that readings were dropped."""
+
+RENEWAL_INTERVAL_S = 60.0
+"""Least interval of publishing again what was lost: what was refused may be refused again."""
 
 STOP_TIMEOUT_S = 2.0
 """Time in which a stopped output sends the remaining readings."""
@@ -87,7 +90,8 @@ def soon_after(stop: Stop, end: Callable[[], None]) -> None:
 class Sending:
     """An adapter that sends what is in a buffer to a receiver.
 
-    At its end, `leaves_file` tells whether no output uses the file any more.
+    At its end, `leaves_file` tells whether no output uses the file any more. `renew` offers the
+    last value of each tag again, or has the next ones of some tags of devices published.
     """
 
     def __init__(
@@ -97,12 +101,16 @@ class Sending:
         buffer: Buffer,
         open_file: Callable[[], Stored] | None = None,
         leaves_file: Callable[[], bool] = bool,
+        renew: Callable[[Collection[tuple[str, str]] | None], object] = bool,
     ) -> None:
         self._name, self._receiver, self._buffer = name, receiver, buffer
-        self._open_file, self._leaves_file = open_file, leaves_file
+        self._open_file, self._leaves_file, self._renew = open_file, leaves_file, renew
         self._sent = self._refused = 0
         self._logged_dropped, self._logged_at = buffer.dropped, -inf
         self._looked_at = -inf
+        self._renewed_dropped, self._renewed_at = buffer.dropped, -inf
+        self._refused_tags: set[tuple[str, str]] = set()
+        """Those of which values were refused since they were published again."""
         self._backoff = Backoff(FIRST_PAUSE_S, MAX_PAUSE_S, jitter=True)
         self._pause = 0.0
         self._last_error: str | None = None
@@ -136,6 +144,7 @@ class Sending:
                     self._wait(stop)
                 self._keep_late()
                 self._log_dropped()
+                self._replace_lost()
             self._finish(stop.at + STOP_TIMEOUT_S)
         except Exception:
             self._keep(STORE_TIMEOUT_S)
@@ -205,6 +214,7 @@ class Sending:
             self._receiver.send(readings)
         except Refused as error:
             refused = len(error.readings)
+            self._refused_tags |= {(each.device, each.name) for each in error.readings}
             log_lines.refused(
                 "output_refused",
                 kind=self._name,
@@ -282,6 +292,19 @@ class Sending:
         if lost > 0 and now >= self._logged_at + every:
             self._logged_dropped, self._logged_at = self._logged_dropped + lost, now
             log_lines.write(logging.WARNING, "output_dropped", output=self._name, count=lost)
+
+    def _replace_lost(self) -> None:
+        """Has values follow that replace what was dropped or refused, if the receiver works.
+
+        An output that publishes changes would leave it with older ones until the next change.
+        """
+        has_lost = self._buffer.dropped > self._renewed_dropped
+        if self._is_failing or not (has_lost or self._refused_tags):
+            return
+        if (now := time.monotonic()) >= self._renewed_at + RENEWAL_INTERVAL_S:
+            self._renewed_dropped, self._renewed_at = self._buffer.dropped, now
+            tags, self._refused_tags = self._refused_tags, set()
+            self._renew(None if has_lost else tags)
 
     def _log_left(self) -> None:
         stored = self._buffer.stored

@@ -12,6 +12,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -207,7 +208,14 @@ class TagValues:
         def leaves() -> bool:
             return all(each.settings.buffer.file != file for each in self._outputs.values())
 
-        return Sending(name, receiver(), output.buffer, None if file is None else opened, leaves)
+        return Sending(
+            name,
+            receiver(),
+            output.buffer,
+            None if file is None else opened,
+            leaves,
+            partial(self.refresh, name),
+        )
 
     def find(self, device: str, tag: str) -> Tag | None:
         """A tag of the configuration."""
@@ -240,12 +248,19 @@ class TagValues:
         with self._lock:
             return dict(self._answering)
 
-    def refresh(self, output: str) -> None:
-        """Offers the last value of each tag to an output again. Thread-safe."""
+    def refresh(self, output: str, tags: Collection[tuple[str, str]] | None = None) -> None:
+        """Offers the last value of each tag to an output again. Thread-safe.
+
+        With `tags` of devices, only has their next values published.
+        """
         with self._lock:
-            if (known := self._outputs.get(output)) is not None:
-                known.changes.forget(self._readers)
-                known.offer(poll for poll, _ in self._latest.values())
+            if (known := self._outputs.get(output)) is None:
+                return
+            if tags is not None:
+                known.changes.forget_tags(tags)
+                return
+            known.changes.forget(self._readers)
+            known.offer(poll for poll, _ in self._latest.values())
 
     def heartbeat(self) -> ThreadHeartbeat | None:
         """The heartbeat of the thread; `None` before the start."""
