@@ -285,6 +285,7 @@ def test_what_can_not_be_sent_at_the_end_is_in_the_file(
     wire.until(lambda: len(again.receiver.sent) == 1501, "all is sent")
     again.end()
     assert again.receiver.sent == list(range(1501))
+    assert again.renewed == []
 
 
 def test_what_a_slow_disk_can_not_store_at_the_end_is_logged(
@@ -402,6 +403,21 @@ def test_a_file_that_can_not_be_opened_stops_nothing(
     wire.until(lambda: output.sending.status()["file_error"] is None, "the file is opened")
     output.end()
     assert count(caplog, "output_file_failed") == 1
+
+
+def test_a_file_that_is_opened_late_is_followed_by_the_last_values(tmp_path: Path) -> None:
+    """What it has is older than what was sent meanwhile."""
+    (tmp_path / "ready").mkdir()
+    stored = Stored(tmp_path / "ready" / "b.db", 2**30, lambda *_: tag())
+    stored.add([numbered(3)])
+    stored.close()
+    output = Running(tmp_path / "missing" / "b.db")
+    output.buffer.offer(polls(1, 3))
+    wire.until(lambda: output.receiver.sent == [3], "it is sent without the file")
+    (tmp_path / "ready").rename(tmp_path / "missing")
+    wire.until(lambda: output.receiver.sent == [3, 0, 1, 2], "the file is sent")
+    output.end()
+    assert output.renewed == [None]
 
 
 def test_a_file_from_which_nothing_can_be_removed_stops_nothing(

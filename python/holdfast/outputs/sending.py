@@ -277,9 +277,13 @@ class Sending:
         """Opens the file, or tries again after an error."""
         if self._open_file is None or self._buffer.stored is not None:
             return
+        is_late = self._file_error is not None
         with self._using_file():
-            self._buffer.stored = self._open_file()
+            stored = self._buffer.stored = self._open_file()
             self._file_error = None
+            if is_late and stored.count:
+                # Newer values than these may have been sent: the last of a tag must be the newest.
+                self._renew(None)
 
     def _keep(self, seconds: float) -> None:
         with self._using_file():
