@@ -9,6 +9,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from holdfast.config.models.outputs import MAX_VALUES
+from holdfast.outputs.file_gone import FileGone
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -22,17 +23,6 @@ MAX_STEP = 20_000
 
 MAX_ROW = 1000
 """Readings in one row of the file, but for the rest of a poll."""
-
-
-class FileGone(OSError):
-    """The file could not be used any more, and is closed: another can be opened in its place.
-
-    `lost` readings waited in it.
-    """
-
-    def __init__(self, message: str, lost: int) -> None:
-        super().__init__(message)
-        self.lost = lost
 
 
 class Buffer:
