@@ -14,7 +14,7 @@ import pytest
 
 from holdfast.config.models.outputs import FileConfig
 from holdfast.outputs.sqlite_file import Database
-from holdfast.outputs.text_file import TextFile
+from holdfast.outputs.text_file import HEAD, TextFile
 from support.line_protocol import parsed
 from support.readings import reading, tag
 from support.renaming import not_renamed
@@ -205,17 +205,41 @@ def test_a_row_that_is_cut_off_anywhere_is_removed(tmp_path: Path, kind: str) ->
 def test_a_text_that_looks_like_a_row_is_not_cut_off(
     tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    for before in range(3):
+    row = f"{TIME},\nmodbus,device=x\n"
+    for text in (f"0\n{row}", f"1\n{row}", f"2\n{row}{row}3", ""):
         file = TextFile(settings(tmp_path / "a", kind))
-        file.send(
-            [reading(f"{before}\n{TIME},\nmodbus,device=x\n", tag=tag("s", type="string:60"))]
-        )
+        file.send([reading(text, tag=tag("s", type="string:160"))])
         file.close()
-    assert (tmp_path / "a").read_bytes().count(b"modbus,device=x\n") == 3
+    assert (tmp_path / "a").read_bytes().count(b"modbus,device=x\n") == 4
     assert not caplog.records
 
 
-@pytest.mark.parametrize("content", [b"\n\0\nSQLite", b"{}", b"time,device\n" + b"x" * (1 << 20)])
+@pytest.mark.parametrize("name", ['5"', 'a="', 'a\\="'])
+def test_a_quote_in_a_name_does_not_begin_a_text(tmp_path: Path, name: str) -> None:
+    for _ in range(2):
+        file = TextFile(settings(tmp_path / "a", "influx"))
+        file.send([reading(1, tag=tag(name)), reading('\\"\n="', tag=tag("s", type="string:8"))])
+        file.send([reading(2, tag=tag(name))])
+        file.close()
+    values = [point.fields[name] for point in parsed((tmp_path / "a").read_bytes())]
+    assert values == [1, 2] * 2
+
+
+@pytest.mark.parametrize("head", [b"time,note,x\n", HEAD])
+def test_rows_behind_a_quote_of_another_program_stay(tmp_path: Path, head: bytes) -> None:
+    path = tmp_path / "a"
+    content = head + b'1,5" pipe,x\n2,b,x\n3,c,x\n'
+    path.write_bytes(content)
+    file = TextFile(settings(path, "csv"))
+    file.send(READINGS[:1])
+    file.close()
+    assert path.read_bytes() == content + f"{TIME},pump,t,21.5,°C,\n".encode()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\n\0\nSQLite", b"{}", b"time,note\n1,a\n2,b", HEAD + b"x" * (1 << 20)],
+)
 def test_what_no_output_has_written_is_not_removed(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a"
     path.write_bytes(content)

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 
 COLUMNS = ("time", "device", "tag", "value", "unit", "error")
 
+HEAD = f"{','.join(COLUMNS)}\n".encode()
+"""The first line of CSV."""
+
 MAX_LINE_BYTES = 1 << 20
 """No line is longer: the last so many bytes of a file have the end of one."""
 
@@ -39,7 +42,7 @@ class TextFile(Receiver):
         self._max_bytes = settings.max_bytes
         self._rotation = Rotation(settings.file, settings.keep, self._not_rotated)
         self._encode = ENCODINGS[settings.format]
-        self._head = f"{','.join(COLUMNS)}\n".encode() if settings.format == "csv" else b""
+        self._head = HEAD if settings.format == "csv" else b""
         self._form = FORMS[settings.format]
         self._open: io.FileIO | None = None
 
@@ -115,7 +118,7 @@ def _end_line(file: io.FileIO, path: Path, form: Form) -> None:
     if not size:
         return
     with path.open("rb") as reading:
-        is_own = reading.read(len(form.begin)) == form.begin
+        is_own = form.begin.startswith(reading.read(len(form.begin)))  # It can be cut off, too.
         reading.seek(max(0, size - MAX_LINE_BYTES))
         tail = reading.read()
     cut = _cut_off(tail, form) if is_own else len(tail) - (tail.rfind(b"\n") + 1)
@@ -131,9 +134,13 @@ def _end_line(file: io.FileIO, path: Path, form: Form) -> None:
 def _cut_off(tail: bytes, form: Form) -> int:
     """The bytes behind the last whole row."""
     # From the last two: what looks like the last one may be within a text.
-    begins = [found.start() for found in form.row.finditer(tail)][-2:] or [0]
-    ends = (next(form.whole.finditer(tail, begin)).end() for begin in begins)
-    return len(tail) - max(ends)
+    begins = [found.start() for found in form.row.finditer(tail)][-2:]
+    end = max((next(form.whole.finditer(tail, begin)).end() for begin in begins), default=0)
+    # Both may be within one text, and rows of another can have a quote that stands alone: whole
+    # lines are removed only if they begin as a row.
+    if not form.row.match(tail, end):
+        end = tail.rfind(b"\n") + 1
+    return len(tail) - end
 
 
 def row(reading: Reading) -> tuple[Any, ...]:
@@ -178,7 +185,7 @@ _INFLUX = f"{MEASUREMENT},device=".encode()
 
 FORMS = {
     "csv": Form(
-        b"time,",
+        HEAD,
         re.compile(rb"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9:.]{15}Z,", re.MULTILINE),
         re.compile(rb'(?:(?:[^"\n]++|"[^"]*+")*+\n)*+'),
     ),
@@ -190,6 +197,9 @@ FORMS = {
     "influx": Form(
         _INFLUX,
         re.compile(b"^" + _INFLUX, re.MULTILINE),
-        re.compile(rb'(?:(?:[^"\n]++|"(?:[^"\\]++|\\.)*+")*+\n)*+', re.DOTALL),
+        # Quotes in names begin no text: only one behind a "=" that is not escaped does.
+        re.compile(
+            rb'(?:(?:[^"\n]++|(?<=[^\\]=)"(?:[^"\\]++|\\.)*+"|(?<![^\\]=)")*+\n)*+', re.DOTALL
+        ),
     ),
 }
