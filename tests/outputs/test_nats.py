@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import pytest
@@ -32,6 +33,22 @@ def output(own_nats: NatsServer) -> Iterator[NatsOutput]:
     made = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")
     yield made
     made.close()
+
+
+@contextmanager
+def denying(folder: Path, subjects: str) -> Iterator[NatsOutput]:
+    """An output that may not publish to some subjects."""
+    (folder / "nats.conf").write_text(
+        'authorization: {users: [{user: u, password: "", permissions: {publish: '
+        f"{{deny: {subjects}}}}}}}]}}"
+    )
+    server = NatsServer(folder, "-c", str(folder / "nats.conf"), jetstream=False)
+    output = NatsOutput(Servers((server.url,), user="u"), "modbus", "tentacle-next")
+    try:
+        yield output
+    finally:
+        output.close()
+        server.kill()
 
 
 def test_values_come_as_messages_of_the_scanner(output: NatsOutput, own_caller: Caller) -> None:
@@ -138,6 +155,21 @@ def test_a_value_that_the_server_does_not_take_is_refused_alone(
     finally:
         output.close()
         server.kill()
+
+
+def test_a_value_counts_once_and_its_state_is_published_again(tmp_path: Path) -> None:
+    with denying(tmp_path, '["modbus.data.BIG.>", "modbus.status.BIG"]') as output:
+        for _ in range(2):
+            with pytest.raises(Refused, match=r"publish to \"modbus\.status\.big\"") as caught:
+                output.send([reading(1, device="BIG"), reading(2), reading(3)])
+            assert caught.value.count == 1
+
+
+def test_a_refused_value_whose_tag_has_a_quote_counts(tmp_path: Path) -> None:
+    with denying(tmp_path, '"modbus.data.pump.>"') as output:
+        with pytest.raises(Refused, match="publish to") as caught:
+            output.send([reading(1, tag=tag('5"')), reading(2), reading(3, device="other")])
+        assert caught.value.count == 2
 
 
 def test_a_lost_connection_is_an_error_at_once(own_nats: NatsServer, output: NatsOutput) -> None:

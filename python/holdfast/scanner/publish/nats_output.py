@@ -53,8 +53,8 @@ class NatsOutput(Receiver):
         self._lost: asyncio.Event | None = None
         """Set when the connection of the client has ended."""
         self._states: dict[str, str] = {}
-        self._refusals: list[str] = []
-        """The reason of each message that the server does not take, since the last step began."""
+        self._forbidden: list[str] = []
+        """The reason of each message that the server forbade, since the last step began."""
 
     def until(self, stop: Stop) -> None:
         """Ends a wait for the server soon after the stop. Called before all else."""
@@ -96,19 +96,35 @@ class NatsOutput(Receiver):
 
     async def _send(self, readings: list[Reading]) -> None:
         client = await self._connected()
-        self._refusals = []  # Those of the connection before do not count.
-        for reading in readings:
+        self._forbidden = []  # Those of the connection before do not count.
+        reasons: list[str] = []
+        refused: set[tuple[str, int]] = set()
+        """Subjects of messages, and which reading each one is of."""
+        published: dict[str, set[int]] = {}
+        """The same, by subject."""
+        for at, reading in enumerate(readings):
             for subject, payload in self._messages(reading):
+                key = subject.lower()  # As in what nats-py tells.
                 if len(payload) > client.max_payload:
                     message = f"{subject}: found {len(payload)} bytes"
-                    self._refusals.append(f"{message}, the server takes {client.max_payload}")
+                    reasons.append(f"{message}, the server takes {client.max_payload}")
+                    refused.add((key, at))
                 else:
+                    published.setdefault(key, set()).add(at)
                     await client.publish(subject, payload)
-        # The server tells of each message that it forbids before it confirms the step, but not of
-        # which: a state counts as the value that came with it.
+        # The server tells of each message that it forbids before it confirms the step.
         await self._confirmed(client)
-        if self._refusals:
-            raise Refused(self._refusals[0], min(len(self._refusals), len(readings)))
+        unknown = 0
+        for reason in self._forbidden:
+            key = reason.partition('"')[2].rpartition('"')[0]
+            refused.update((key, at) for at in published.get(key, ()))
+            unknown += key not in published  # Of a name with a quote: a backslash is added.
+        for key, at in refused:
+            if key.startswith(f"{self._prefix}.status.".lower()):
+                self._states.pop(readings[at].device, None)  # It is published again.
+        if reasons := reasons + self._forbidden:
+            count = len({at for _, at in refused}) + unknown
+            raise Refused(reasons[0], min(count, len(readings)))
 
     async def _confirmed(self, client: SafeClient) -> None:
         """Waits until the server has everything. A connection that ends is an error at once."""
@@ -162,7 +178,7 @@ class NatsOutput(Receiver):
 
     async def _note_error(self, error: Exception) -> None:
         """Notes a message that the server forbids. Any other error also ends `send`."""
-        self._refusals.append(nats_reason(error))
+        self._forbidden.append(nats_reason(error))
 
     def _close_client(self) -> None:
         client, self._client = self._client, None
