@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -104,27 +105,25 @@ class NatsOutput(Receiver):
         """The same, by subject."""
         for at, reading in enumerate(readings):
             for subject, payload in self._messages(reading):
-                key = subject.lower()  # As in what nats-py tells.
                 if len(payload) > client.max_payload:
                     message = f"{subject}: found {len(payload)} bytes"
                     reasons.append(f"{message}, the server takes {client.max_payload}")
-                    refused.add((key, at))
+                    refused.add((subject, at))
                 else:
-                    published.setdefault(key, set()).add(at)
+                    published.setdefault(subject, set()).add(at)
                     await client.publish(subject, payload)
         # The server tells of each message that it forbids before it confirms the step.
         await self._confirmed(client)
-        unknown = 0
-        for reason in self._forbidden:
-            key = reason.partition('"')[2].rpartition('"')[0]
-            refused.update((key, at) for at in published.get(key, ()))
-            unknown += key not in published  # Of a name with a quote: a backslash is added.
-        for key, at in refused:
-            if key.startswith(f"{self._prefix}.status.".lower()):
+        reasons += self._forbidden
+        forbidden = {reason.partition('"')[2].rpartition('"')[0] for reason in self._forbidden}
+        for subject, which in published.items():
+            if _as_told(subject) in forbidden:
+                refused.update((subject, at) for at in which)
+        for subject, at in refused:
+            if subject.startswith(f"{self._prefix}.status."):
                 self._states.pop(readings[at].device, None)  # It is published again.
-        if reasons := reasons + self._forbidden:
-            count = len({at for _, at in refused}) + unknown
-            raise Refused(reasons[0], min(count, len(readings)))
+        if reasons:
+            raise Refused(reasons[0], [readings[at] for at in sorted({at for _, at in refused})])
 
     async def _confirmed(self, client: SafeClient) -> None:
         """Waits until the server has everything. A connection that ends is an error at once."""
@@ -212,3 +211,8 @@ class NatsOutput(Receiver):
             (f"{self._prefix}.status.{name}", payload)
             for name in self._dialect.device_names(device)
         ]
+
+
+def _as_told(subject: str) -> str:
+    """A subject as in the error of the server, which quotes it, and of nats-py: without capitals."""
+    return json.dumps(subject, ensure_ascii=False)[1:-1].lower()
