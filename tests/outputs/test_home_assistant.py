@@ -61,6 +61,7 @@ def all_of(tags: dict[str, list[Tag]], info: DeviceInfo = INFO, **more: Any) -> 
 
 
 STATES = {0: "off", 1: "it's on"}
+ON_AT_170 = {85: "off", 170: "on"}
 
 MOVING = RegisterScale("exponent", source=Tag("", "holding_registers", 1, "int16"))
 
@@ -86,10 +87,17 @@ def test_each_kind_of_tag_is_a_valid_entity(of: Tag, component: str) -> None:
 
 
 @pytest.mark.parametrize("writes", [False, True])
-def test_an_inverted_coil_is_on_where_its_states_say_on(writes: bool) -> None:
-    of = tag(area="coils", type="bool", states={0: "on", 1: "off"}, writable=True)
-    config = found(of, writes=writes).config
-    assert (config["payload_on"], config["payload_off"]) == ("on", "off")
+@pytest.mark.parametrize(
+    "of",
+    [
+        tag(area="coils", type="bool", states={0: "on", 1: "off"}, writable=True),
+        tag(area="holding_registers", type="uint16", states=ON_AT_170, writable=True),
+    ],
+)
+def test_what_is_on_or_off_by_its_states_is_a_switch(of: Tag, writes: bool) -> None:
+    entity = found(of, writes=writes)
+    assert entity.component == ("switch" if writes else "binary_sensor")
+    assert (entity.config["payload_on"], entity.config["payload_off"]) == ("on", "off")
 
 
 @pytest.mark.parametrize(
@@ -131,6 +139,8 @@ def test_no_two_tags_have_one_id() -> None:
         (tag(type="uint16", scale=0.5, states=STATES), 1.0, "it's on"),
         (tag(type="uint16", scale=0.5, states=STATES), 0.5, "None"),
         (tag(type="uint16", states=STATES), None, "None"),
+        (tag(type="uint16", states=ON_AT_170), 170, "on"),
+        (tag(type="uint16", states=ON_AT_170), 1, "None"),
         (tag(area="coils", type="bool"), True, "true"),
         (tag(area="coils", type="bool"), False, "false"),
         (tag(area="coils", type="bool"), None, "None"),

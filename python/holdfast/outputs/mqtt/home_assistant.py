@@ -197,8 +197,9 @@ class Discovery:
         # Commands are refused for tags whose scale is in a register.
         writes = self._settings.writes and tag.writable and tag.source is None
         command = {"command_topic": self._names.of_commands(device, tag.name)} if writes else {}
-        if tag.of_type.base in ("bool", "bit"):
-            on, off = text_of(tag, True), text_of(tag, False)
+        is_on_or_off = set(tag.states.values()) == {"on", "off"}
+        if is_on_or_off or tag.of_type.base in ("bool", "bit"):
+            on, off = ("on", "off") if is_on_or_off else (text_of(tag, True), text_of(tag, False))
             if off == "on":  # A relay that is on at 0: Home Assistant has no names, only on.
                 on, off = off, on
             if not writes:
