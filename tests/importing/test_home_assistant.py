@@ -295,6 +295,12 @@ def test_a_coil_that_is_always_written_alike_is_left_out(
         "climates: [{name: a, address: 1, target_temp_register: 3, data_type: float32, "
         "fan_mode_register: {address: 4, write_registers: true, values: {state_fan_on: 1}}}]"
         "\n    covers: [{name: b, address: 2}]",
+        "climates: [{name: a, address: 1, target_temp_register: 3, data_type: float32, "
+        "fan_mode_register: {address: [4], values: {state_fan_on: 1}}}]"
+        "\n    covers: [{name: b, address: 2}]",
+        "climates: [{name: a, address: 1, target_temp_register: 3, data_type: float32, "
+        "swing_mode_register: {address: [4], values: {swing_mode_state_on: 1}}}]"
+        "\n    covers: [{name: b, address: 2}]",
     ],
 )
 def test_a_device_that_was_written_with_the_functions_for_several_still_is(

@@ -430,7 +430,9 @@ def _mode(places: Places, entity: Section, key: str, *, writable: bool) -> None:
     values = register.mapping("values")
     area = _area(register, "input_type", "holding", _REGISTERS)
     if writable:
-        places.written[register.flag("write_registers") or False].append(register.path)
+        # The source wrote with function 16 if the address of a fan or swing mode was a list.
+        is_multiple = register.flag("write_registers") or isinstance(register.get("address"), list)
+        places.written[is_multiple].append(register.path)
     register.close()
     if not given or values is None:
         message = "without address and values, allowed: with both"
