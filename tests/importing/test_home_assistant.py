@@ -395,6 +395,23 @@ def test_only_numbers_that_the_source_wrote_can_be_written(
     } <= set(notes(found))
 
 
+def test_each_register_of_a_setpoint_is_a_number_with_its_modes(
+    imported: Callable[..., Imported],
+) -> None:
+    climate = "name: pool, address: 21, target_temp_register: [2, 4, 4, 4, 3, 3, 2], max_temp: 40"
+    found = imported(f"climates: [{{{climate}}}]")
+    numbers = {name: tag for name, tag in tags(found).items() if "setpoint" in name}
+    assert {name: tag["address"] for name, tag in numbers.items()} == {
+        "pool_setpoint_auto_off": 2,
+        "pool_setpoint_cool_dry_fan_only": 4,
+        "pool_setpoint_heat_heat_cool": 3,
+    }
+    assert all(tag["writable"] and tag["max"] == 40 for tag in numbers.values())
+    message = "a number for each register, with its modes; the source used that of the mode"
+    key = "modbus[0].climates[0].target_temp_register"
+    assert f"8: {key}: changed: {message}" in notes(found)
+
+
 def test_a_number_with_several_names_has_the_first_of_the_source(
     imported: Callable[..., Imported],
 ) -> None:
@@ -596,15 +613,26 @@ def test_what_would_be_another_value_is_refused(
 @pytest.mark.parametrize(
     ("climate", "message"),
     [
-        ("min_temp: 30, max_temp: 20", "max_temp: found 20, allowed: at least min_temp, 30"),
-        ("min_temp: 40", "min_temp: found 40, allowed: up to max_temp, 35"),
+        (
+            "target_temp_register: 2, min_temp: 30, max_temp: 20",
+            "max_temp: found 20, allowed: at least min_temp, 30",
+        ),
+        (
+            "target_temp_register: 2, min_temp: 40",
+            "min_temp: found 40, allowed: up to max_temp, 35",
+        ),
+        (
+            "target_temp_register: [2, 3]",
+            "target_temp_register: found 2 registers, allowed: 1, or 7, for auto, cool, dry, "
+            "fan_only, heat, heat_cool, off",
+        ),
     ],
 )
 def test_a_thermostat_without_a_setpoint_that_it_allows_is_refused(
     imported: Callable[..., Imported], climate: str, message: str
 ) -> None:
     with pytest.raises(NotImportable) as raised:
-        imported(f"climates: [{{name: x, address: 1, target_temp_register: 2, {climate}}}]")
+        imported(f"climates: [{{name: x, address: 1, {climate}}}]")
     assert refusals(raised.value) == [f"8: modbus[0].climates[0].{message}"]
 
 

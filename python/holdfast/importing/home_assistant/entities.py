@@ -54,6 +54,9 @@ _ACTIONS = ("cooling", "defrosting", "drying", "fan", "heating", "idle")
 _SEARCHED = (*_ACTIONS, "off", "heat", "cool", "heat_cool", "auto", "dry", "fan_only", "preheating")
 """The order in which the source looked for the action or the mode of a number."""
 
+_TARGET_MODES = ("auto", "cool", "dry", "fan_only", "heat", "heat_cool", "off")
+"""The modes that the registers of a list of setpoints are for."""
+
 _MODES = ("hvac_mode_register", "fan_mode_register", "swing_mode_register")
 
 
@@ -385,6 +388,10 @@ def _climate(places: Places, entity: Section) -> None:
     if not target:
         message = "missing, allowed: the address of the setpoint"
         entity.desk.problem_of_key(entity.at("target_temp_register"), message)
+    elif len(target) not in (1, len(_TARGET_MODES)):
+        allowed = f"allowed: 1, or {len(_TARGET_MODES)}, for {', '.join(_TARGET_MODES)}"
+        message = f"found {len(target)} registers, {allowed}"
+        entity.desk.problem(entity.at("target_temp_register"), message)
     for key in _MODES:
         _mode(places, entity, key, writable=True)
     _mode(places, entity, "hvac_action_register", writable=False)
@@ -396,15 +403,20 @@ def _climate(places: Places, entity: Section) -> None:
     if address is None or settings is None or not target:
         return
     entity.desk.changed(entity.path, "a sensor, a number and selects instead of a thermostat")
-    if len(set(target)) > 1:
-        message = "the first register is the setpoint; the source had one for each mode"
+    modes: dict[int, list[str]] = {}
+    for mode, register in zip(_TARGET_MODES, target, strict=False):
+        modes.setdefault(register, []).append(mode)
+    if len(modes) > 1:
+        message = "a number for each register, with its modes; the source used that of the mode"
         entity.desk.changed(entity.at("target_temp_register"), message)
     places.add(_name(entity), area, address, **_given({**settings, **current, "unit": unit}))
     if register_count(settings["type"]) == 1:
         is_multiple = entity.flag("target_temp_write_registers") or False
         places.written[is_multiple].append(entity.at("target_temp_register"))
     written = {**_given({**settings, **aim, "unit": unit}), "writable": True, **limits}
-    places.add(f"{_name(entity)} setpoint", "holding_registers", target[0], **written)
+    for register, names in modes.items():
+        title = " ".join([_name(entity), "setpoint", *(names if len(modes) > 1 else ())])
+        places.add(title, "holding_registers", register, **written)
 
 
 def _limits(entity: Section) -> dict[str, float]:
