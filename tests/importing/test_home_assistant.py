@@ -230,7 +230,10 @@ def test_switches_write_the_numbers_that_the_source_wrote(
         "writable": True,
         "description": "Coil",
     }
-    assert found_tags["register"]["type"] == "bool"
+    assert (found_tags["register"].get("type"), found_tags["register"]["states"]) == (
+        None,
+        {0: "off", 1: "on"},
+    )
     assert found_tags["numbers"]["states"] == {85: "off", 170: "on"}
     assert found_tags["elsewhere_state"]["states"] == {0: "off", 1: "off (1)", 2: "on"}
     assert (found_tags["elsewhere_state"]["area"], found_tags["elsewhere_state"]["address"]) == (
@@ -243,6 +246,34 @@ def test_switches_write_the_numbers_that_the_source_wrote(
     assert [note for note in notes(found) if blind in note] == [
         f"13: modbus[0].switches[4]: check: {blind}"
     ]
+
+
+@pytest.mark.parametrize(
+    ("switch", "area", "address", "states"),
+    [
+        ("verify: {address: 44}", "holding_registers", 44, {0: "off", 1: "on"}),
+        ("verify: {input_type: input}", "input_registers", 7, {0: "off", 1: "on"}),
+        ("verify: {address: 44, input_type: coil}", "coils", 44, None),
+        ("verify: {state_on: [1, 3]}", "holding_registers", 7, {0: "off", 1: "on", 3: "on (3)"}),
+        (
+            "write_type: coil, command_on: 255, verify: {input_type: holding}",
+            "holding_registers",
+            7,
+            {0: "off", 255: "on"},
+        ),
+    ],
+)
+def test_a_register_is_on_and_off_at_the_numbers_of_its_switch_only(
+    imported: Callable[..., Imported], switch: str, area: str, address: int, states: Any
+) -> None:
+    tag = tags(imported(f"lights: [{{name: lamp, address: 7, {switch}}}]"))["lamp_state"]
+    assert (tag["area"], tag["address"], tag.get("states")) == (area, address, states)
+    assert "type" not in tag
+
+
+def test_a_thermostat_is_off_at_0_only(imported: Callable[..., Imported]) -> None:
+    climate = "{name: hall, address: 30, target_temp_register: 31, hvac_onoff_register: 32}"
+    assert tags(imported(f"climates: [{climate}]"))["hall_power"]["type"] == "bool"
 
 
 def test_an_inverted_coil_is_on_at_0(imported: Callable[..., Imported]) -> None:

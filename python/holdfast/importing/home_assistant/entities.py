@@ -272,47 +272,44 @@ def _switch(places: Places, entity: Section) -> None:
     area = _area(entity, "write_type", "holding", kinds)
     address = _address(entity)
     on, off = _register(entity, "command_on", 1), _register(entity, "command_off", 0)
-    if area in _BITS:  # The source wrote every number but 0 as 1.
-        on, off = min(on, 1), min(off, 1)
     verify = entity.mapping("verify")
     if address is None:
         return
-    if on == off:
-        message = f"{_name(entity)} writes {on} for on and for off: add a tag"
-        entity.desk.left_out(entity.path, message)
+    settings = _commands(entity, area, on, off)
+    if settings is None:
         return
     places.written[entity.get("write_type") in ("holdings", "coils")].append(entity.path)
-    settings = _two_states(entity, area, [on], [off])
     places.add(_name(entity), area, address, **settings, writable=True)
-    if verify is None:
-        if "verify" not in entity.data:
-            message = "its state is read from its address; the source did not read it"
-            entity.desk.check(entity.path, message)
+    if "verify" not in entity.data:
+        message = "its state is read from its address; the source did not read it"
+        entity.desk.check(entity.path, message)
         return
-    _verify(places, entity, verify, (area, address, [on], [off]))
-
-
-_Written: TypeAlias = "tuple[Area, int, list[int], list[int]]"
-"""Where a switch is, and its numbers for on and off."""
-
-
-def _verify(places: Places, entity: Section, verify: Section, written: _Written) -> None:
-    """A tag of its own for a state that is read elsewhere."""
-    area, address, on, off = written
+    if verify is None:
+        return
     kind = verify.word("input_type", tuple(_AREAS))
     its_area = _AREAS[kind] if kind else area
     its_address = _address(verify, required=False)
     its_address = address if its_address is None else its_address
-    its_on, its_off = _numbers(verify, "state_on") or on, _numbers(verify, "state_off") or off
+    its_on, its_off = _numbers(verify, "state_on") or [on], _numbers(verify, "state_off") or [off]
     if its_area in _BITS:
         its_on, its_off = [1], [0]  # The source read 1 as on, whatever it wrote.
     verify.integer("delay", 0, 86_400)  # A write that is confirmed is read back at once.
     verify.close()
-    if (its_area, its_address, its_on, its_off) == (area, address, on, off):
-        return
-    settings = _two_states(entity, its_area, its_on, its_off, writable=False)
-    places.add(f"{_name(entity)} state", its_area, its_address, **settings)
-    entity.desk.changed(verify.path, "the state that is read is an entity of its own")
+    its_settings = _two_states(entity, its_area, its_on, its_off)
+    if (its_area, its_address, its_settings) != (area, address, settings):
+        places.add(f"{_name(entity)} state", its_area, its_address, **its_settings)
+        entity.desk.changed(verify.path, "the state that is read is an entity of its own")
+
+
+def _commands(entity: Section, area: Area, on: int, off: int) -> dict[str, Any] | None:
+    """The settings of a tag that is written on and off; `None` if both are the same."""
+    if area in _BITS:  # The source wrote every number but 0 as 1.
+        on, off = min(on, 1), min(off, 1)
+    if on == off:
+        message = f"{_name(entity)} writes {on} for on and for off: add a tag"
+        entity.desk.left_out(entity.path, message)
+        return None
+    return _two_states(entity, area, [on], [off])
 
 
 def _numbers(entity: Section, key: str) -> list[int]:
@@ -326,14 +323,10 @@ def _numbers(entity: Section, key: str) -> list[int]:
     return []
 
 
-def _two_states(
-    entity: Section, area: Area, on: list[int], off: list[int], *, writable: bool = True
-) -> dict[str, Any]:
-    """A bit, a register that is a bit, or one with names for its numbers."""
-    if (on, off) == ([1], [0]):
-        return {} if area in _BITS else {"type": "bool"}
-    if writable and area not in _BITS:
-        entity.desk.changed(entity.path, "a select of on and off instead of a switch")
+def _two_states(entity: Section, area: Area, on: list[int], off: list[int]) -> dict[str, Any]:
+    """A bit, or names for the numbers: all others of a register are neither on nor off."""
+    if area in _BITS and (on, off) == ([1], [0]):
+        return {}
     names = [*((number, "on") for number in on), *((number, "off") for number in off)]
     return _states(entity.desk, ((number, name, entity.path) for number, name in names))
 
@@ -481,7 +474,9 @@ def _power(places: Places, entity: Section) -> None:
         places.add(name, "coils", coil, writable=True)
     if register is not None:
         places.written[is_multiple].append(entity.at("hvac_onoff_register"))
-        settings = _two_states(entity, "holding_registers", [on], [off])
+        settings: dict[str, Any] = {"type": "bool"}  # Only 0 was off.
+        if (on, off) != (1, 0):
+            settings = _two_states(entity, "holding_registers", [on], [off])
         places.add(name, "holding_registers", register, **settings, writable=True)
 
 
