@@ -300,6 +300,16 @@ def test_an_inverted_coil_is_on_at_0(imported: Callable[..., Imported]) -> None:
     assert not [note for note in notes(found) if "instead of a switch" in note]
 
 
+@pytest.mark.parametrize("verify", ["", "{delay: 1}", "{input_type: coil}"])
+def test_the_source_read_1_as_on_also_of_an_inverted_coil(
+    imported: Callable[..., Imported], verify: str
+) -> None:
+    inverted = "write_type: coil, command_on: 0, command_off: 1"
+    found = imported(f"switches: [{{name: x, address: 1, {inverted}, verify: {verify}}}]")
+    assert tags(found)["x"]["states"] == {0: "on", 1: "off"}
+    assert tags(found)["x_state"] == {"area": "coils", "address": 1, "description": "x state"}
+
+
 @pytest.mark.parametrize("commands", ["command_on: 0", "command_on: 2, command_off: 3"])
 def test_a_coil_that_is_always_written_alike_is_left_out(
     imported: Callable[..., Imported], commands: str

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.config.text.messages import show
+from holdfast.importing.key_reader import Section
 from holdfast.importing.names import MAX_LENGTH, free_name
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.values import encode, register_count
@@ -17,7 +18,6 @@ from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from holdfast.config.text.yaml_document import KeyPath
-    from holdfast.importing.key_reader import Section
     from holdfast.importing.notes import Desk
     from holdfast.types import Area
 
@@ -284,8 +284,8 @@ def _switch(places: Places, entity: Section) -> None:
         message = "its state is read from its address; the source did not read it"
         entity.desk.check(entity.path, message)
         return
-    if verify is None:
-        return
+    # An empty key reads the state, too.
+    verify = verify or Section(entity.desk, entity.at("verify"), {})
     kind = verify.word("input_type", tuple(_AREAS))
     its_area = _AREAS[kind] if kind else area
     its_address = _address(verify, required=False)
