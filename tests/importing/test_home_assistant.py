@@ -401,6 +401,33 @@ def test_covers_and_climates_become_their_registers(imported: Callable[..., Impo
     assert found_tags["hall_power"]["area"] == "coils"
 
 
+@pytest.mark.parametrize(
+    ("cover", "states"),
+    [
+        ("state_open: 0, state_closed: 1, status_register: 9", {0: "on", 1: "off"}),
+        ("state_open: 5, status_register: 9", None),
+        ("state_open: 0, state_closed: 1", None),
+    ],
+)
+def test_a_coil_of_a_cover_opens_when_it_is_switched_on(
+    imported: Callable[..., Imported], cover: str, states: Any
+) -> None:
+    """Without a status register, the source wrote 1 to open."""
+    found = imported(f"covers: [{{name: door, address: 3, input_type: coil, {cover}}}]")
+    assert tags(found)["door"].get("states") == states
+    assert tags(found)["door"]["writable"]
+
+
+def test_a_coil_of_a_cover_that_is_always_written_alike_is_left_out(
+    imported: Callable[..., Imported],
+) -> None:
+    cover = "{name: door, address: 3, input_type: coil, state_closed: 2, status_register: 9}"
+    found = imported(f"covers: [{cover}]")
+    assert list(tags(found)) == ["door_status"]
+    message = "left out: door writes 1 for on and for off: add a tag"
+    assert f"8: modbus[0].covers[0]: {message}" in notes(found)
+
+
 def test_only_numbers_that_the_source_wrote_can_be_written(
     imported: Callable[..., Imported],
 ) -> None:

@@ -361,9 +361,14 @@ def _cover(places: Places, entity: Section) -> None:
     kind = "switch" if area in _BITS else "select"
     more = "" if status is None else " and a sensor"
     entity.desk.changed(entity.path, f"a {kind}{more} instead of a cover")
-    places.written[False].append(entity.path)
-    settings = {} if area in _BITS else _states(entity.desk, numbers[:2])
-    places.add(_name(entity), area, address, **settings, writable=True)
+    settings: dict[str, Any] | None = {}
+    if area not in _BITS:
+        settings = _states(entity.desk, numbers[:2])
+    elif status is not None:  # Without one, the source wrote 1 to open, whatever is given.
+        settings = _commands(entity, area, on=numbers[1][0], off=numbers[0][0])
+    if settings is not None:
+        places.written[False].append(entity.path)
+        places.add(_name(entity), area, address, **settings, writable=True)
     if status is not None:
         states = _states(entity.desk, numbers)
         places.add(f"{_name(entity)} status", status_area, status, **states)
