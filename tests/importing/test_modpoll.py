@@ -202,6 +202,18 @@ def test_one_bit_of_coils_is_that_of_two_bytes(
     assert [each for each in notes(found) if "left out" in each] == [told[it] for it in left_out]
 
 
+def test_a_list_of_bits_ends_with_the_reply(read: Callable[[str], Imported]) -> None:
+    found = read(
+        "device,plant,1\npoll,coil,0,24,BE_BE\nref,a,0,bool16,r\nref,b,2,bool16,r\nref,c,4,bool16,r\n"
+    )
+    tags = found.data["devices"]["plant"]["tags"]
+    assert [tag["address"] for name, tag in tags.items() if name.startswith("b_")] == [
+        *range(23, 15, -1)
+    ]
+    told = "c: left out: the reply ended before its byte; the source had no value"
+    assert [each for each in notes(found) if "left out" in each] == [f"5: plant.{told}"]
+
+
 def test_what_the_source_did_not_read_is_left_out(read: Callable[[str], Imported]) -> None:
     found = read(
         "# plant of 2024\n"

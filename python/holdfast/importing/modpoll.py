@@ -365,12 +365,11 @@ def _bit_tags(desk: Desk, poll: _Poll) -> Iterator[tuple[KeyPath, str, dict[str,
         first = poll.start + 8 * byte
         is_known = each.type in _WIDTHS | _LISTS or each.type.startswith("string")
         is_list = each.type in _LISTS and each.bit is None
-        taken = (each.width if is_list else 2 * each.width) if is_known else 0
-        byte += taken
+        byte += (each.width if is_list else 2 * each.width) if is_known else 0
         if each.type not in _LISTS:
             message = f"{show(each.type)} is no type of coils here, allowed: bool, bool8, bool16"
             desk.left_out(each.path, message)
-        elif first + 8 * (taken - 1) >= poll.end:
+        elif first + (0 if is_list else 8) >= poll.end:  # A list has what is left.
             desk.left_out(each.path, "the reply ended before its byte; the source had no value")
         elif each.bit is not None:
             # A bit of a number with 16 bits, whose first coil is the highest bit.
