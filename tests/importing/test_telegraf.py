@@ -529,6 +529,7 @@ def field_of(settings: str) -> str:
 
 
 PLACE = "11: inputs.modbus[0].request[0].fields[0]"
+BEYOND = "changed: numbers beyond {} stay as they are; the source had other ones"
 
 
 @pytest.mark.parametrize(
@@ -536,12 +537,11 @@ PLACE = "11: inputs.modbus[0].request[0].fields[0]"
     [
         ('type="INT16", scale=0.1, output="INT64"',
          f"{PLACE}.scale: changed: digits behind the point are kept; the source dropped them"),
-        ('type="INT16", output="UINT64"',
-         f"{PLACE}.output: changed: numbers beyond the output type stay as they are; the source "
-         "wrapped them"),
-        ('type="UINT64", output="INT64"',
-         f"{PLACE}.output: changed: numbers beyond the output type stay as they are; the source "
-         "wrapped them"),
+        ('type="INT16", output="UINT64"', f"{PLACE}.output: {BEYOND.format('UINT64')}"),
+        ('type="UINT64", output="INT64"', f"{PLACE}.output: {BEYOND.format('INT64')}"),
+        ('type="UINT16", scale=-2.0, output="UINT64"',
+         f"{PLACE}.output: {BEYOND.format('UINT64')}"),
+        ('type="INT64", scale=10.0, output="INT64"', f"{PLACE}.output: {BEYOND.format('INT64')}"),
         ('type="BIT", scale=2.0', f"{PLACE}.scale: left out: the source ignored it for bits"),
         ('type="INT16", digits=2', f"{PLACE}.digits: left out: unknown key"),
     ],
@@ -553,7 +553,12 @@ def test_a_note_names_a_value_that_differs(
 
 
 @pytest.mark.parametrize(
-    "settings", ['type="INT16", scale=10.0, output="INT64"', 'type="INT16", scale=0.1']
+    "settings",
+    [
+        'type="INT16", scale=10.0, output="INT64"',
+        'type="INT16", scale=0.1',
+        'type="UINT64", scale=1.0, output="UINT64"',
+    ],
 )
 def test_values_that_are_the_same_need_no_note(
     imported: Callable[[str], Imported], settings: str
@@ -569,6 +574,15 @@ def test_integers_of_the_style_register_are_not_truncated(
         "14: inputs.modbus[0].input_registers[0].scale: changed: digits behind the point are "
         "kept; the source dropped them"
     ]
+
+
+@pytest.mark.parametrize("scale", ["10.0", "-1.0"])
+def test_numbers_beyond_the_integers_of_the_style_register_have_a_note(
+    imported: Callable[[str], Imported], scale: str
+) -> None:
+    found = imported(changed("scale=1.0", f"scale={scale}"))
+    place = "14: inputs.modbus[0].input_registers[0].scale"
+    assert notes(found) == [f"{place}: {BEYOND.format('INT32')}"]
 
 
 @pytest.mark.parametrize("kind", ["INT8L", "INT8H", "UINT8L", "UINT8H"])

@@ -14,6 +14,7 @@ from holdfast.runtime.text import listing
 from holdfast.tags.read_gap import DEFAULT_MAX_GAP
 from holdfast.types import BIT_AREAS
 from holdfast.values import register_count
+from holdfast.values.numeric import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -397,10 +398,14 @@ class Fields:
         if not was_float and not is_whole:
             message = "digits behind the point are kept; the source dropped them"
             self.desk.changed(entry.at("scale"), message)
-        signed = kind.startswith("INT")
-        if (signed and output == "UINT64") or (kind == "UINT64" and output == "INT64"):
-            message = "numbers beyond the output type stay as they are; the source wrapped them"
-            self.desk.changed(entry.at("output"), message)
+        if not was_float:
+            key, kept = ("scale", kind) if output == "native" else ("output", output)
+            factor = int(scale) if is_whole else scale
+            ends = [factor * end for end in limits(_TYPES[kind])]
+            least, most = limits(_TYPES[kept])
+            if min(ends) < least or max(ends) > most:
+                message = f"numbers beyond {kept} stay as they are; the source had other ones"
+                self.desk.changed(entry.at(key), message)
         settings = {"type": _TYPES[kind]}
         small = register_count(settings["type"]) == 1
         settings |= _order(_OF_ONE_REGISTER[order] if small else order)
