@@ -237,6 +237,17 @@ def test_the_columns_of_csv_have_an_order(tmp_path: Path) -> None:
     assert tag == replace(plain, unit="°C", writable=True, description="outside")
 
 
+@pytest.mark.parametrize("first", ["", "sep=;\n", "# a list\n\nsep=;\n"])
+@pytest.mark.parametrize("names", ["", "name;area;address;type;order;scale;unit\n"])
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_the_first_line_tells_what_separates_cells(
+    tmp_path: Path, first: str, names: str, separator: str
+) -> None:
+    text = f"{first}{names}t;hr;3;int16;;0.1;{'' if names else ';'}V\n".replace(";", separator)
+    [tag] = load_tags(written(tmp_path, text, "t.csv"))
+    assert tag == Tag("t", "holding_registers", 3, "int16", scale=0.1, unit="V")
+
+
 def test_a_tag_list_has_more_room_than_a_configuration(tmp_path: Path) -> None:
     lines = ["a,hr,1\n", *["# a comment\n"] * 150_000]
     assert len(load_tags(written(tmp_path, "".join(lines), "t.csv"))) == 1
@@ -300,6 +311,7 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
             "name;area;address;scale\nx;hr;1;0,1\n",
             "t.csv:2: tags.x.scale: '0,1' has a decimal comma, allowed: a decimal point, as in 0.1",
         ),
+        ("t.csv", "a;hr;1\nsep=;\n", "t.csv:2: tags.'sep='"),
         ("t.csv", "", "t.csv:1: tags: "),
         ("t.yaml", "- a\n", "t.yaml:1: found a list, allowed: a mapping with the keys order"),
         ("t.yaml", "tags: {a: {area: coils}}\n", "t.yaml:1: tags.a.address: missing"),

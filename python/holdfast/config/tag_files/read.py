@@ -138,7 +138,7 @@ class _Table:
 def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:
     table, columns = _Table(file), list[str]()
     sample = next((line for line in text.splitlines() if line.strip() and line[0] != "#"), "")
-    separator = ";" if sample.count(";") > sample.count(",") else ","
+    separator = max(",;\t", key=sample.count)
     rows = csv.reader(io.StringIO(text, newline=None), delimiter=separator, strict=True)
     first = 1
     try:
@@ -146,6 +146,8 @@ def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:
             first = rows.line_num + 1
             cells = [cell.strip() for cell in row]
             if not any(cells) or cells[0].startswith("#"):
+                continue
+            if not columns and cells == ["sep=", ""]:  # The separator in a line of its own.
                 continue
             if columns:
                 table.take(rows.line_num, columns, cells)
