@@ -50,7 +50,7 @@ def nats(tmp_path: Path) -> Iterator[NatsServer]:
 def node(nats: NatsServer) -> Iterator[Callable[..., Node]]:
     with ExitStack() as stack:
 
-        def start(name: str, **options: Any) -> Node:
-            return Node(stack, name, [nats.url], **options)
+        def start(name: str, servers: list[str] | None = None, **options: Any) -> Node:
+            return Node(stack, name, servers or [nats.url], **options)
 
         yield start

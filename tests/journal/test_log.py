@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -12,6 +14,7 @@ import holdfast
 from holdfast._core import Log, LogError, LogReader
 from support import wire
 from support.brokers import free_port
+from support.tcp_proxy import Proxy
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -91,6 +94,34 @@ def test_a_write_that_is_not_confirmed_in_time_gets_exception_4(
     assert refusal(lambda: a.client.write_register(0, 1)) == 4
     assert a.log.status()["not_confirmed"] == 1
     nats.thaw()
+
+
+def test_a_write_that_the_network_delivers_late_does_not_replace_a_newer_one(
+    node: Start, nats: NatsServer
+) -> None:
+    seconds = 0.1
+    with closing(Proxy(nats.port, "nats")) as proxy:
+        a, b = node("a", servers=[proxy.url], write_timeout=seconds), node("b")
+        proxy.hold()
+        # On a loaded machine, one may not be sent in time: 6.
+        wire.until(lambda: refusal(lambda: a.client.write_register(0, 111)) == 4, "it is sent")
+        # Until then, the log still takes it.
+        end = time.monotonic() + 2 * seconds
+        wire.until(lambda: time.monotonic() > end, "its time is over")
+        b.client.write_register(0, 222)
+        memory = plant()
+        reader = LogReader("site", [nats.url], [("plant", memory)], follow=True)
+        proxy.go_on()
+        late: list[Any] = []
+        while not late:
+            record = reader.next(wire.DEADLINE)
+            late += [] if record is None or record["node"] != "a" else record["steps"]
+        writes = [("plant", "holding_registers", 0, [111])]
+        assert [(step["writes"], step["refused"]) for step in late] == [(writes, "not_confirmed")]
+        last = reader.sequence
+        wire.until(lambda: min(each.log.status()["sequence"] for each in (a, b)) >= last, "all do")
+        assert memory.read("holding_registers", 0, 1) == [222]
+        assert (a.read(0), b.read(0)) == (222, 222)
 
 
 def test_reads_are_refused_without_contact(node: Start, nats: NatsServer) -> None:

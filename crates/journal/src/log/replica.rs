@@ -42,12 +42,12 @@ impl Replica {
 
 /// A message, decoded and encoded again. `None`: these bytes are not a message for these memories.
 pub fn again(payload: &[u8], members: &[Arc<Memory>]) -> Option<Vec<u8>> {
-    let Message { origin, compares, steps } = message::decode(payload, members).ok()?;
+    let Message { origin, compares, deadline, steps } = message::decode(payload, members).ok()?;
     let encoded = |step: &Step| {
         let mut bytes = Vec::new();
         encoding::encode(step, &mut bytes);
         bytes
     };
     let steps: Vec<Vec<u8>> = steps.iter().map(encoded).collect();
-    Some(message::encode(&origin, compares, steps.iter().map(Vec::as_slice)).to_vec())
+    Some(message::encode(&origin, compares, deadline, steps.iter().map(Vec::as_slice)).to_vec())
 }

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use aws_lc_rs::digest::{SHA256, digest};
 use bytes::Buf;
-use holdfast_memory::{CarriedOut, Contents, Memory, Outcome, Step};
+use holdfast_memory::{CarriedOut, Contents, Memory, Outcome, Refusal, Refused, Step};
 use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
@@ -16,7 +16,7 @@ use super::error::LogError;
 use super::lease_terms::LeaseTerms;
 use super::settings::is_word;
 use crate::log::stream::message::{
-    self, MAX_NODES, Message, MessageError, Origin, VERSION, WITHOUT_LEASES,
+    self, MAX_NODES, Message, MessageError, Origin, VERSION, WITH_LEASES, WITHOUT_LEASES,
 };
 
 /// An encoded state begins with it.
@@ -105,18 +105,19 @@ impl State {
         age: impl FnOnce(&Origin) -> Option<Duration>,
     ) -> Result<Applied, LogError> {
         debug_assert_eq!(place.sequence, self.place.sequence + 1, "messages are applied in order");
-        let Message { origin, compares, steps } = match message::decode(payload, &self.members) {
-            Ok(message) => message,
-            Err(MessageError::Version(found)) => {
-                let what = "a message of the log";
-                return Err(LogError::Version { what, found, supported: VERSION });
-            }
-            // It has a place in the order all the same: all nodes ignore it there.
-            Err(error) => {
-                self.place = place;
-                return Ok(Applied::Ignored(error));
-            }
-        };
+        let Message { origin, compares, deadline, steps } =
+            match message::decode(payload, &self.members) {
+                Ok(message) => message,
+                Err(MessageError::Version(found)) => {
+                    let what = "a message of the log";
+                    return Err(LogError::Version { what, found, supported: VERSION });
+                }
+                // It has a place in the order all the same: all nodes ignore it there.
+                Err(error) => {
+                    self.place = place;
+                    return Ok(Applied::Ignored(error));
+                }
+            };
         self.place = place;
         // A message that was sent again, or one that a later start of its node has overtaken.
         let now = (origin.start, origin.counter);
@@ -131,8 +132,13 @@ impl State {
         self.steps += steps.len() as u64;
         let at = |done| CarriedOut { sequence: Some(place.sequence), ..done };
         let age = age(&origin);
+        // Whoever wrote them was told long ago that they were not confirmed, and newer ones may have been.
+        let is_late = deadline.is_some_and(|deadline| place.stored > deadline);
         let carried_out = |step: &Step| {
             self.terms.admit(step.tenure)?;
+            if is_late {
+                return Err(Refused { index: 0, refusal: Refusal::NotConfirmed });
+            }
             step.carry_out_late(&self.members, age).map(at)
         };
         let outcomes = steps.iter().map(carried_out).collect();
@@ -141,7 +147,7 @@ impl State {
 
     /// The version of the encoded state.
     pub(super) fn version(&self) -> u8 {
-        if self.terms.is_empty() { WITHOUT_LEASES } else { VERSION }
+        if self.terms.is_empty() { WITHOUT_LEASES } else { WITH_LEASES }
     }
 
     /// How long the contents are.
@@ -190,9 +196,9 @@ impl State {
         let malformed = || LogError::Snapshot("the snapshot of the log is malformed".to_owned());
         let bytes = bytes.strip_prefix(&MARK).ok_or_else(malformed)?;
         let (&found, mut rest) = bytes.split_first().ok_or_else(malformed)?;
-        if !(WITHOUT_LEASES..=VERSION).contains(&found) {
+        if !(WITHOUT_LEASES..=WITH_LEASES).contains(&found) {
             let what = "the snapshot of the log";
-            return Err(LogError::Version { what, found, supported: VERSION });
+            return Err(LogError::Version { what, found, supported: WITH_LEASES });
         }
         let loaded = loaded(&mut rest, found, &self.members).filter(|_| rest.is_empty());
         let Loaded { place, steps, origins, terms, contents } = loaded.ok_or_else(malformed)?;
@@ -236,7 +242,7 @@ fn loaded(bytes: &mut &[u8], version: u8, members: &[Arc<Memory>]) -> Option<Loa
         let node = is_word(node).then(|| node.to_owned())?;
         origins.insert(node, (bytes.try_get_u64_le().ok()?, bytes.try_get_u64_le().ok()?));
     }
-    let has_leases = version == VERSION;
+    let has_leases = version == WITH_LEASES;
     let terms = if has_leases { LeaseTerms::decode(bytes)? } else { LeaseTerms::default() };
     if bytes.try_get_u32_le().ok()? as usize != members.len() {
         return None;
@@ -262,9 +268,10 @@ fn contents(bytes: &mut &[u8], memory: &Memory) -> Option<Contents> {
 
 #[cfg(test)]
 mod tests {
-    use holdfast_memory::{Area, Layout, Span, Tenure, Term};
+    use holdfast_memory::{Access, Action, Area, Layout, Span, StepWrite, Tenure, Term};
 
     use super::*;
+    use crate::encoding;
 
     fn member() -> Arc<Memory> {
         let layout = Layout::default().with(Area::Coils, Span::new(0, 8).unwrap());
@@ -297,7 +304,7 @@ mod tests {
         assert_eq!(state.version(), WITHOUT_LEASES);
         state.terms.admit(tenure(1, 5)).unwrap();
         let saved = state.encode();
-        assert_eq!(saved[3], VERSION);
+        assert_eq!(saved[3], WITH_LEASES);
         let mut loaded = State::new(vec![member()]);
         loaded.load(&saved, state.place).unwrap();
         assert_eq!((loaded.encode(), &loaded.terms), (saved, &state.terms));
@@ -308,6 +315,31 @@ mod tests {
             loaded.terms.admit(tenure(1, 5)).is_ok() && loaded.terms.admit(tenure(2, 1)).is_ok()
         );
         assert!(loaded.terms.admit(tenure(1, 9)).is_err());
+    }
+
+    #[test]
+    fn steps_that_the_stream_stored_behind_their_deadline_are_refused() {
+        let mut state = State::new(vec![member()]);
+        let mut apply = |sequence: u64, stored, deadline, coils: u8| {
+            let (member, area, bytes) = (0, Area::Coils, vec![coils]);
+            let write = StepWrite { member, area, address: 0, count: 8, bytes };
+            let action = Action::Write(vec![write]);
+            let mut step = Vec::new();
+            encoding::encode(&Step { access: Access::Client, tenure: None, action }, &mut step);
+            let origin = Origin { node: "a".to_owned(), start: 1, counter: sequence };
+            let payload = message::encode(&origin, false, deadline, [&step[..]].into_iter());
+            let place = Place { sequence, stored };
+            let Applied::Fresh { outcomes, .. } = state.apply(place, &payload, |_| None).unwrap()
+            else {
+                panic!("it is fresh");
+            };
+            let outcome = outcomes[0].clone().map(|_| ()).map_err(|refused| refused.refusal);
+            (outcome, Memory::contents(&state.members)[0].areas[0][0])
+        };
+        assert_eq!(apply(1, 500, Some(500), 1), (Ok(()), 1));
+        assert_eq!(apply(2, 501, Some(500), 2), (Err(Refusal::NotConfirmed), 1));
+        assert_eq!(apply(3, 502, None, 3), (Ok(()), 3), "of an older node");
+        assert_eq!(state.last_counter("a", 1), 3);
     }
 
     #[test]

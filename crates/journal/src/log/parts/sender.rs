@@ -48,6 +48,8 @@ pub(in crate::log) struct Sender {
     /// Of the last message that was sent.
     counter: u64,
     in_flight: InFlight,
+    /// What the clock of the stream has shown at least, and when: a message was applied that it stored then.
+    stream_time: Option<(i64, Instant)>,
     /// Why the stream has refused messages, since the last one of this node was applied.
     refusal: Option<String>,
 }
@@ -103,9 +105,16 @@ impl Start {
 
 impl Sender {
     pub(in crate::log) fn new(settings: &Arc<Settings>, shared: &Arc<Shared>) -> Sender {
-        let (in_flight, refusal) = (InFlight::default(), None);
         let (settings, shared) = (Arc::clone(settings), Arc::clone(shared));
-        Sender { settings, shared, start: Start::None, counter: 0, in_flight, refusal }
+        Sender {
+            settings,
+            shared,
+            start: Start::None,
+            counter: 0,
+            in_flight: InFlight::default(),
+            stream_time: None,
+            refusal: None,
+        }
     }
 
     pub(in crate::log) fn has_started(&self) -> bool {
@@ -158,12 +167,15 @@ impl Sender {
         self.in_flight.first_sent(self.own_counter(origin)?)
     }
 
-    /// A message was applied. Returns its number if this process has sent it.
+    /// A message was applied that the stream stored at this time. Returns its number if this process has
+    /// sent it.
     pub(in crate::log) fn applied(
         &mut self,
         origin: &Origin,
+        stored: i64,
         outcomes: Vec<Outcome>,
     ) -> Result<Option<u64>, End> {
+        self.stream_time = Some((stored, Instant::now()));
         self.check_start(origin)?;
         let Some(counter) = self.own_counter(origin) else { return Ok(None) };
         self.start = Start::Applied(origin.start);
@@ -238,7 +250,8 @@ impl Sender {
         let Batch { steps, mut dones, until } = batch;
         self.counter += 1;
         let origin = self.origin(self.counter);
-        let payload = message::encode(&origin, compares, steps.iter().map(Vec::as_slice));
+        let deadline = (!steps.is_empty()).then(|| self.deadline(until));
+        let payload = message::encode(&origin, compares, deadline, steps.iter().map(Vec::as_slice));
         if self.settings.answers_early {
             dones.drain(..).for_each(|done| done(Ok(CarriedOut::default())));
         }
@@ -247,6 +260,15 @@ impl Sender {
         self.in_flight.push(message, dones, self.shared.now(), until);
         publisher.publish(&origin, payload).await?;
         Ok(self.counter)
+    }
+
+    /// When the stream may store steps at the latest that are answered at `until`, by its own clock. A cut
+    /// network can deliver them later: the system goes on sending what this process has handed over.
+    fn deadline(&self, until: Instant) -> i64 {
+        let (stored, at) = self.stream_time.expect("steps are taken once a message was applied");
+        // The time is short by what that message took to arrive.
+        let left = until.saturating_duration_since(at) + self.settings.write_timeout;
+        stored.saturating_add(i64::try_from(left.as_nanos()).unwrap_or(i64::MAX))
     }
 
     fn origin(&self, counter: u64) -> Origin {
@@ -393,7 +415,7 @@ mod tests {
     #[test]
     fn a_start_is_behind_all_starts_of_the_node_in_the_log() {
         let mut sender = sender();
-        assert!(sender.applied(&origin("a", 5), Vec::new()).is_ok(), "an earlier process");
+        assert!(sender.applied(&origin("a", 5), 0, Vec::new()).is_ok(), "an earlier process");
         sender.ensure_start(5).unwrap();
         assert!(sender.start.number() > 5);
     }
@@ -413,17 +435,29 @@ mod tests {
         let mut sender = sender();
         sender.ensure_start(5).unwrap();
         let own = sender.start.number();
-        assert_eq!(sender.applied(&origin("b", own), Vec::new()).unwrap(), None);
-        assert_eq!(sender.applied(&origin("a", own), Vec::new()).unwrap(), Some(1));
+        assert_eq!(sender.applied(&origin("b", own), 0, Vec::new()).unwrap(), None);
+        assert_eq!(sender.applied(&origin("a", own), 0, Vec::new()).unwrap(), Some(1));
         assert!(sender.check_start(&origin("b", own + 1)).is_ok());
         let taken = sender.check_start(&origin("a", own + 1));
         assert!(matches!(taken, Err(End::Fatal(LogError::NameTaken(_)))), "{taken:?}");
     }
 
     #[test]
+    fn steps_have_as_long_again_as_their_writers_wait_by_the_clock_of_the_stream() {
+        const SECOND: i64 = 1_000_000_000;
+        let (mut sender, before) = (sender(), Instant::now());
+        sender.applied(&origin("b", 1), 100 * SECOND, Vec::new()).unwrap();
+        let until = Instant::now() + Duration::from_secs(3);
+        let since = i64::try_from(before.elapsed().as_nanos()).unwrap();
+        let (deadline, usual) = (sender.deadline(until), 104 * SECOND);
+        assert!((usual..=usual + since).contains(&deadline), "{deadline}");
+        assert_eq!(sender.deadline(before), 101 * SECOND, "their time is over");
+    }
+
+    #[test]
     fn a_message_with_start_0_is_not_of_a_process_that_has_sent_nothing() {
         let mut sender = sender();
-        assert_eq!(sender.applied(&origin("a", 0), Vec::new()).unwrap(), None);
+        assert_eq!(sender.applied(&origin("a", 0), 0, Vec::new()).unwrap(), None);
         assert!(sender.check_start(&origin("a", 5)).is_ok());
     }
 }

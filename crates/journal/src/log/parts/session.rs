@@ -199,7 +199,8 @@ impl<'n> Session<'n> {
         match applied {
             Applied::Fresh { origin, compares: is_asked, outcomes } => {
                 compares = is_asked;
-                if let Some(counter) = self.node.sender.applied(&origin, outcomes)? {
+                let stored = received.place.stored;
+                if let Some(counter) = self.node.sender.applied(&origin, stored, outcomes)? {
                     is_for_snapshot = self.node.snapshotter.is_requested_at(counter);
                     self.applied_own(counter);
                 }

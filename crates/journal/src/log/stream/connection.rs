@@ -1,5 +1,5 @@
-//! One connection to the servers. It is not made again: what it had not sent is lost with it, and
-//! is not sent later.
+//! One connection to the servers. It is not made again: what it had not sent is lost with it. What it
+//! had handed to the system may still arrive later; steps have a deadline for that.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

@@ -13,8 +13,11 @@ use crate::log::settings::is_word;
 
 const MARK: [u8; 3] = *b"HFL";
 
-/// The newest version of messages and snapshots: steps may be under leases.
-pub(in crate::log) const VERSION: u8 = 2;
+/// The newest version of messages: with a deadline. Older nodes would carry out what all others refuse.
+pub(in crate::log) const VERSION: u8 = 3;
+
+/// The version of messages without a deadline, and the newest one of snapshots: steps may be under leases.
+pub(in crate::log) const WITH_LEASES: u8 = 2;
 
 /// The version of messages and snapshots without leases: older nodes read it.
 pub(in crate::log) const WITHOUT_LEASES: u8 = 1;
@@ -41,6 +44,9 @@ pub(in crate::log) struct Message {
     pub(in crate::log) origin: Origin,
     /// Whether all nodes compare their contents here.
     pub(in crate::log) compares: bool,
+    /// The steps of a message that the stream has stored later are refused. In nanoseconds of Unix time, by
+    /// the clock of the stream.
+    pub(in crate::log) deadline: Option<i64>,
     pub(in crate::log) steps: Vec<Step>,
 }
 
@@ -69,18 +75,26 @@ pub(in crate::log) const OVERHEAD_BYTES: usize = 128;
 pub(in crate::log) fn encode<'a>(
     origin: &Origin,
     compares: bool,
+    deadline: Option<i64>,
     steps: impl ExactSizeIterator<Item = &'a [u8]> + Clone,
 ) -> Bytes {
     let len: usize = steps.clone().map(|step| step.len() + 4).sum();
     let mut out = Vec::with_capacity(len + OVERHEAD_BYTES);
     out.extend_from_slice(&MARK);
     let has_leases = steps.clone().any(encoding::is_under_lease);
-    out.push(if has_leases { VERSION } else { WITHOUT_LEASES });
+    out.push(match deadline {
+        Some(_) => VERSION,
+        None if has_leases => WITH_LEASES,
+        None => WITHOUT_LEASES,
+    });
     out.push(u8::from(compares));
     out.push(u8::try_from(origin.node.len()).expect("names of nodes are short"));
     out.extend_from_slice(origin.node.as_bytes());
     out.extend_from_slice(&origin.start.to_le_bytes());
     out.extend_from_slice(&origin.counter.to_le_bytes());
+    if let Some(deadline) = deadline {
+        out.extend_from_slice(&deadline.to_le_bytes());
+    }
     for step in steps {
         out.extend_from_slice(&u32::try_from(step.len()).expect("steps are short").to_le_bytes());
         out.extend_from_slice(step);
@@ -102,6 +116,10 @@ pub(in crate::log) fn decode(
         _ => return Err(MessageError::Malformed),
     };
     let origin = origin(&mut bytes).ok_or(MessageError::Malformed)?;
+    let deadline = match version {
+        VERSION => Some(bytes.try_get_i64_le().or(Err(MessageError::Malformed))?),
+        _ => None,
+    };
     let mut steps = Vec::new();
     while !bytes.is_empty() {
         let step = step(&mut bytes).ok_or(MessageError::Malformed)?;
@@ -110,7 +128,7 @@ pub(in crate::log) fn decode(
             encoding::decode(step, members).map_err(|error| MessageError::Step { index, error })?;
         steps.push(step);
     }
-    Ok(Message { origin, compares, steps })
+    Ok(Message { origin, compares, deadline, steps })
 }
 
 fn origin(bytes: &mut &[u8]) -> Option<Origin> {
@@ -145,7 +163,7 @@ mod tests {
         Step { access: Access::Client, tenure: None, action }
     }
 
-    fn encoded(origin: &Origin, compares: bool, steps: &[Step]) -> Bytes {
+    fn encoded(origin: &Origin, compares: bool, deadline: Option<i64>, steps: &[Step]) -> Bytes {
         let steps: Vec<Vec<u8>> = steps
             .iter()
             .map(|step| {
@@ -154,7 +172,7 @@ mod tests {
                 bytes
             })
             .collect();
-        encode(origin, compares, steps.iter().map(Vec::as_slice))
+        encode(origin, compares, deadline, steps.iter().map(Vec::as_slice))
     }
 
     proptest! {
@@ -164,22 +182,23 @@ mod tests {
             start: u64,
             counter: u64,
             compares: bool,
+            deadline: Option<i64>,
             addresses in prop::collection::vec(0..10u16, 0..5),
         ) {
             let origin = Origin { node, start, counter };
             let steps: Vec<Step> = addresses.into_iter().map(mask).collect();
-            let bytes = encoded(&origin, compares, &steps);
-            let message = Message { origin, compares, steps };
+            let bytes = encoded(&origin, compares, deadline, &steps);
+            let message = Message { origin, compares, deadline, steps };
             prop_assert_eq!(decode(&bytes, &members()), Ok(message));
         }
 
         #[test]
         fn any_bytes_are_a_message_or_an_error(
-            marked: bool,
+            version in prop::option::of(WITHOUT_LEASES..=VERSION),
             mut bytes in prop::collection::vec(any::<u8>(), 0..100),
         ) {
-            if marked {
-                bytes.splice(0..0, *b"HFL\x01\x00\x01a");
+            if let Some(version) = version {
+                bytes.splice(0..0, [&MARK[..], &[version], b"\x00\x01a"].concat());
             }
             let _ = decode(&bytes, &members());
         }
@@ -187,7 +206,7 @@ mod tests {
         #[test]
         fn changed_bytes_are_a_message_or_an_error(at in any::<prop::sample::Index>(), byte: u8) {
             let origin = Origin { node: "a".to_owned(), start: 1, counter: 2 };
-            let mut bytes = encoded(&origin, false, &[mask(1), mask(2)]).to_vec();
+            let mut bytes = encoded(&origin, false, Some(3), &[mask(1), mask(2)]).to_vec();
             let at = at.index(bytes.len());
             bytes[at] = byte;
             let _ = decode(&bytes, &members());
@@ -198,10 +217,10 @@ mod tests {
     fn bytes_of_others_are_distinguished_from_another_version() {
         let of = |bytes: &[u8]| decode(bytes, &members());
         assert_eq!(of(b"hello"), Err(MessageError::Foreign));
-        assert_eq!(of(b"HFL\x03whatever"), Err(MessageError::Version(3)));
+        assert_eq!(of(b"HFL\x04whatever"), Err(MessageError::Version(4)));
         assert_eq!(of(b"HFL\x01"), Err(MessageError::Malformed));
         let origin = Origin { node: "a".to_owned(), start: 1, counter: 2 };
-        let error = of(&encoded(&origin, false, &[mask(1), mask(10)])).unwrap_err();
+        let error = of(&encoded(&origin, false, None, &[mask(1), mask(10)])).unwrap_err();
         assert!(matches!(error, MessageError::Step { index: 1, .. }), "{error}");
     }
 }
