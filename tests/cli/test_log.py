@@ -213,6 +213,94 @@ def test_a_log_that_can_not_be_rebuilt_is_not_backed_up(tmp_path: Path) -> None:
     assert not backup.exists()
 
 
+class Snapshots:
+    """Replaces the snapshot of a log, as nodes do, when its keys or what they name was fetched."""
+
+    def __init__(self, url: str, times: int, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.url, self.times, self.fetched = url, times, log_backup._fetch
+        self.names: list[str] = []
+        monkeypatch.setattr(log_backup, "_fetch", self.fetch)
+
+    async def fetch(self, client: Any, name: str, file: Path) -> Any:
+        if name.startswith("OBJ_") and len(self.names) < self.times:
+            await self.replace()
+        return await self.fetched(client, name, file)
+
+    async def replace(self) -> None:
+        client = await nats.connect(self.url)
+        jetstream = client.jetstream()
+        keys = await jetstream.key_value("holdfast-log-site")
+        objects = await jetstream.object_store("holdfast-log-site")
+        pointer = json.loads((await keys.get("snapshot")).value or b"")
+        former, name = pointer["newest"]["object"], f"snapshot {len(self.names)}"
+        await objects.put(name, (await objects.get(former)).data or b"")
+        pointer["newest"]["object"] = name
+        await keys.put("snapshot", json.dumps(pointer).encode())
+        await objects.delete(former)
+        self.names.append(name)
+        await client.close()
+
+
+def test_a_backup_begins_again_when_its_snapshot_was_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders = [tmp_path / name for name in ("one", "other")]
+    for folder in folders:
+        folder.mkdir()
+    one, other = map(NatsServer, folders)
+    file = configuration(tmp_path, servers=[one.url])
+    try:
+        with Appliance(load(file)) as appliance:
+            write(appliance, 1, 7)
+        snapshots = Snapshots(one.url, log_backup.ATTEMPTS - 1, monkeypatch)
+        done("log", "backup", str(file), str(tmp_path / "backup"))
+        assert len(snapshots.names) == log_backup.ATTEMPTS - 1
+        snapshots.times += log_backup.ATTEMPTS
+        assert "have replaced the snapshot 5 times" in failed("backup", file, tmp_path / "late")
+        file = configuration(tmp_path, servers=[other.url])
+        done("log", "restore", str(file), str(tmp_path / "backup"))
+        with Appliance(load(file)) as appliance:
+            assert register(appliance, 1) == 7
+    finally:
+        one.kill()
+        other.kill()
+    assert not (tmp_path / "late").exists()
+
+
+class Messages:
+    """Servers that send one part of a stream."""
+
+    def __init__(self, *states: tuple[int, int]) -> None:
+        states_of = [dict(zip(("last_seq", "messages"), each, strict=True)) for each in states]
+        self.answers = [{"config": {}, "state": each} for each in states_of]
+        self.parts = [SimpleNamespace(data=data, reply="", headers=None) for data in (b"part", b"")]
+
+    def new_inbox(self) -> str:
+        return "inbox"
+
+    async def subscribe(self, _: str) -> Any:
+        async def next_msg(**_: object) -> object:
+            return self.parts.pop(0)
+
+        async def unsubscribe() -> None:
+            pass
+
+        return SimpleNamespace(next_msg=next_msg, unsubscribe=unsubscribe)
+
+    async def request(self, *_: object, **__: object) -> Any:
+        return SimpleNamespace(data=json.dumps(self.answers.pop(0)).encode())
+
+
+def test_a_stream_that_loses_messages_while_it_is_fetched_is_fetched_again(tmp_path: Path) -> None:
+    def fetch(*states: tuple[int, int]) -> dict[str, Any]:
+        client: Any = Messages(*states)
+        return asyncio.run(log_backup._fetch(client, "site", tmp_path / "site"))
+
+    assert fetch((9, 5), (12, 8))["state"]["messages"] == 5  # Messages were added.
+    with pytest.raises(log_backup._Replaced):
+        fetch((9, 5), (12, 7))
+
+
 def test_servers_without_the_log_are_told(tmp_path: Path) -> None:
     (tmp_path / "server").mkdir()
     server = NatsServer(tmp_path / "server")

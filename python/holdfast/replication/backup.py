@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from nats.errors import Error, NoRespondersError
 
@@ -45,6 +45,14 @@ USELESS = (
     "no node could begin with the backup; try again when a node that runs has stored a new snapshot"
 )
 
+ATTEMPTS = 5
+"""How often a backup is begun, at most: nodes may replace the snapshot that it begins with."""
+
+REPLACED = (
+    f"nodes have replaced the snapshot {ATTEMPTS} times before it and what follows was fetched: "
+    "try again when less is written, or nearer to the servers"
+)
+
 CHUNK_BYTES = 128 * 1024
 ANSWER_TIMEOUT_S = 30.0
 """Seconds within which a server must answer, or send the next part."""
@@ -61,6 +69,10 @@ class BackupFailed(Exception):
     """The message says what can't be done, and why."""
 
 
+class _Replaced(BackupFailed):
+    """Nodes have replaced the snapshot, or removed messages, while streams were fetched."""
+
+
 class _NotFound(BackupFailed):
     """The servers don't have the stream."""
 
@@ -70,6 +82,14 @@ class _NoMessage(BackupFailed):
 
 
 _KINDS = {STREAM_NOT_FOUND: _NotFound, NO_MESSAGE_FOUND: _NoMessage}
+
+
+class _Snapshot(NamedTuple):
+    """The newest snapshot of a log, and the sequence of the key that names it."""
+
+    key: int
+    sequence: int
+    object: str
 
 
 def streams(log: str) -> list[str]:
@@ -87,7 +107,8 @@ def back_up(servers: Servers, log: str, folder: Path) -> int:
     """Writes a backup to a new folder. Returns the number of messages. Raises `BackupFailed`.
 
     What is confirmed later is not in it. Nodes may run: the newest snapshot is fetched before the
-    steps that follow it. A log that could not be rebuilt from it is refused.
+    steps that follow it, and all again if it was replaced meanwhile. A log that could not be
+    rebuilt from it is refused.
     """
     try:
         folder.mkdir()
@@ -166,43 +187,38 @@ async def _config(client: SafeClient, name: str) -> dict[str, Any] | None:
         return None
 
 
-async def _last(client: SafeClient, stream: str, subject: str) -> bytes:
-    """The last message with this subject; empty if the stream has none."""
+async def _last(client: SafeClient, stream: str, subject: str) -> tuple[int, bytes]:
+    """The last message with this subject, and its sequence; empty if the stream has none."""
     try:
         found = await _ask(client, f"STREAM.MSG.GET.{stream}", {"last_by_subj": subject})
     except _NoMessage:
-        return b""
-    return base64.b64decode(found["message"].get("data", ""))
+        return 0, b""
+    message = found["message"]
+    return int(message["seq"]), base64.b64decode(message.get("data", ""))
 
 
-async def _newest_snapshot(client: SafeClient, log: str) -> int:
-    """The sequence of the newest snapshot. Raises `BackupFailed` if there is none."""
-    keys, objects, steps = streams(log)
-    key = await _last(client, keys, f"$KV.{steps}.{SNAPSHOT_KEY}")
+async def _newest_snapshot(client: SafeClient, log: str) -> _Snapshot:
+    """Raises `BackupFailed` if there is none."""
+    keys, _, steps = streams(log)
+    at, key = await _last(client, keys, f"$KV.{steps}.{SNAPSHOT_KEY}")
     if not key:
         raise BackupFailed(f"{keys} has no key {SNAPSHOT_KEY}: {USELESS}")
     try:
         newest = json.loads(key)["newest"]
-        sequence, name = int(newest["sequence"]), str(newest["object"])
+        return _Snapshot(at, int(newest["sequence"]), str(newest["object"]))
     except (ValueError, KeyError, TypeError) as error:
         reason = f"{keys}: the key {SNAPSHOT_KEY} is {key[:100]!r}, not a snapshot: {USELESS}"
         raise BackupFailed(reason) from error
-    encoded = base64.urlsafe_b64encode(name.encode()).decode()
-    if not await _last(client, objects, f"$O.{steps}.M.{encoded}"):
-        raise BackupFailed(f"{objects} has no object {name}, the newest snapshot: {USELESS}")
-    return sequence
 
 
 async def _back_up(client: SafeClient, log: str, folder: Path) -> int:
-    contents, newest = {}, 0
-    for name in streams(log):
-        contents[name] = await _fetch(client, name, folder / name)
-        if not newest:  # Steps before it may be removed while the rest is fetched.
-            newest = await _newest_snapshot(client, log)
-    first = int(contents[streams(log)[-1]]["state"]["first_seq"])
-    if first > newest + 1:
-        reason = f"messages {newest + 1} to {first - 1} behind the newest snapshot are missing"
-        raise BackupFailed(f"{reason}: {USELESS}")
+    for attempt in range(1, ATTEMPTS + 1):
+        try:
+            contents = await _fetch_all(client, log, folder)
+            break
+        except _Replaced:
+            if attempt == ATTEMPTS:
+                raise
     text = json.dumps({"version": VERSION, "log": log, "streams": contents}, indent=2)
     with (folder / "backup.json").open("xb") as out:
         out.write(text.encode())
@@ -211,14 +227,49 @@ async def _back_up(client: SafeClient, log: str, folder: Path) -> int:
     return int(contents[streams(log)[-1]]["state"]["messages"])
 
 
+async def _fetch_all(client: SafeClient, log: str, folder: Path) -> dict[str, dict[str, Any]]:
+    """Writes all streams to files. Raises `_Replaced` if they don't have what the keys name."""
+    keys, objects, steps = streams(log)
+    contents = {keys: await _fetch(client, keys, folder / keys)}
+    newest = await _newest_snapshot(client, log)
+    if newest.key > int(contents[keys]["state"]["last_seq"]):
+        raise _Replaced(REPLACED)  # The file names another one.
+    for name in (objects, steps):
+        contents[name] = await _fetch(client, name, folder / name)
+    missing = await _missing(client, log, newest)
+    if missing is not None:
+        if await _newest_snapshot(client, log) != newest:
+            raise _Replaced(REPLACED)
+        raise BackupFailed(f"{missing}: {USELESS}")
+    return contents
+
+
+async def _missing(client: SafeClient, log: str, snapshot: _Snapshot) -> str | None:
+    """What the servers lack of a snapshot and the steps behind it; `None` if they have all."""
+    _, objects, steps = streams(log)
+    encoded = base64.urlsafe_b64encode(snapshot.object.encode()).decode()
+    _, meta = await _last(client, objects, f"$O.{steps}.M.{encoded}")
+    if not _is_there(meta):
+        return f"{objects} has no object {snapshot.object}, the newest snapshot"
+    next_step = snapshot.sequence + 1
+    first = int((await _ask(client, f"STREAM.INFO.{steps}"))["state"]["first_seq"])
+    if first > next_step:
+        return f"messages {next_step} to {first - 1} behind the newest snapshot are missing"
+    return None
+
+
 async def _fetch(client: SafeClient, name: str, file: Path) -> dict[str, Any]:
-    """Writes a stream to a file. Returns what a server needs to restore it."""
+    """Writes a stream to a file. Returns what a server needs to restore it.
+
+    Raises `_Replaced` if messages were removed meanwhile: the server sends each part of a stream as
+    it is when its turn comes, so the file may lack them.
+    """
     inbox = client.new_inbox()
     parts = await client.subscribe(inbox)
     request = {"deliver_subject": inbox, "no_consumers": True, "chunk_size": CHUNK_BYTES}
     answer = await _ask(client, f"STREAM.SNAPSHOT.{name}", request)
     digest = hashlib.sha256()
-    with file.open("xb") as out:
+    with file.open("wb") as out:
         while True:
             part = await parts.next_msg(timeout=ANSWER_TIMEOUT_S)
             if not part.data:
@@ -233,11 +284,27 @@ async def _fetch(client: SafeClient, name: str, file: Path) -> dict[str, Any]:
         out.flush()
         os.fsync(out.fileno())
     await parts.unsubscribe()
+    now = (await _ask(client, f"STREAM.INFO.{name}"))["state"]
+    if _removed(now) != _removed(answer["state"]):
+        raise _Replaced(REPLACED)
     return {
         "config": answer["config"],
         "state": answer["state"],
         "sha256": digest.hexdigest(),
     }
+
+
+def _is_there(meta: bytes) -> bool:
+    """Whether an object has not been deleted: its description says so then."""
+    try:
+        return not json.loads(meta).get("deleted")
+    except (ValueError, AttributeError):
+        return False
+
+
+def _removed(state: dict[str, Any]) -> int:
+    """How many messages a stream has had and does not have any more."""
+    return int(state["last_seq"]) - int(state["messages"])
 
 
 def _checked(folder: Path, log: str) -> dict[str, Any]:
@@ -298,7 +365,7 @@ async def _send(
     if "error" in found:
         raise BackupFailed(f"{name}: {_error(reply.data)}")
     messages = found["state"]["messages"]
-    if messages != content["state"]["messages"]:
+    if messages < content["state"]["messages"]:
         raise BackupFailed(f"{name}: the server has restored {messages} messages only")
 
 
