@@ -549,7 +549,7 @@ def test_a_replay_that_follows_serves_what_it_has_followed(
         replay.end(signal.SIGTERM)
 
 
-def test_a_replay_to_behind_the_end_of_the_log_says_so(
+def test_a_replay_to_before_or_behind_the_log_says_so(
     node: Callable[..., Appliance], tmp_path: Path
 ) -> None:
     one = node("a")
@@ -562,6 +562,11 @@ def test_a_replay_to_behind_the_end_of_the_log_says_so(
     assert (result.exit_code, result.stdout) == (1, "")
     expected = f"holdfast: logs.site: --to is {last + 1}, but the log ends at sequence {last}, 2"
     assert result.stderr.startswith(expected)
+    result = invoke("log", "replay", file, "--to", "2000-01-01T00:00Z")
+    assert (result.exit_code, result.stdout.split(",")[0]) == (0, "sequence 0")
+    assert result.stderr == (
+        "holdfast: --to is before the first message: these are the values that the log began with\n"
+    )
     result = invoke("log", "replay", file, "--json", "--to", "2200-01-01T00:00Z")
     assert (result.exit_code, json.loads(result.stdout)) == (0, told)
     expected = f"holdfast: --to is after the last message: the log ends at sequence {last}, 2"

@@ -57,7 +57,8 @@ MAX_TIME_NS = 2**63 - 1
     "--to",
     "SEQUENCE|TIME",
     "The last step: its sequence in the stream, or a time as in 2026-11-20T14:05:00Z. "
-    "A sequence that the log does not have is an error; a time after its last message is noted. "
+    "A sequence that the log does not have is an error; a time before its first message, or after "
+    "its last one, is noted. "
     "Default: the last one there is.",
 )
 @flag("--follow", "Print each step, also those to come.")
@@ -225,7 +226,7 @@ def _within(number: int, most: int) -> int:
 
 
 def _check_end(replaying: _core.LogReader, sequence: int | None, time_ns: int | None) -> None:
-    """Raises `ValueError` for a sequence that the log does not have, and notes a time after it."""
+    """Raises `ValueError` for a sequence that the log does not have, and notes a time beyond it."""
     when = log_lines.timestamp(replaying.time_ns / 1e9)
     end = f"the log ends at sequence {replaying.sequence}, {when}"
     if sequence is not None and sequence > replaying.sequence:
@@ -233,6 +234,9 @@ def _check_end(replaying: _core.LogReader, sequence: int | None, time_ns: int | 
     is_last = replaying.sequence >= replaying.last_sequence
     if time_ns is not None and is_last and time_ns > replaying.time_ns:
         click.echo(f"holdfast: --to is after the last message: {end}", err=True)
+    if time_ns is not None and not is_last and replaying.sequence == 0:
+        began = "these are the values that the log began with"
+        click.echo(f"holdfast: --to is before the first message: {began}", err=True)
 
 
 def _tell(
