@@ -243,7 +243,8 @@ class LogStatus(TypedDict):
     were current for sure. `steps`, `unavailable`, `not_confirmed`, `not_stored` and `refused` count
     the outcomes of steps of this node. `stale` and `ignored` count messages of the stream that were
     applied before, and that no node has sent. `digest`: sequence, digest, and whether other nodes
-    have the same. `snapshot`: the sequence of the newest one.
+    have the same. `snapshot`: the sequence of the newest one. `replicas`: on how many servers it
+    is.
     """
 
     phase: Literal["starting", "running", "returning", "failed", "stopped"]

@@ -96,16 +96,24 @@ def test_a_log_grows_from_one_server_to_three(tmp_path: Path, cluster: list[Nats
 
 
 def test_a_log_is_kept_by_as_many_servers_as_wanted(
-    tmp_path: Path, cluster: list[NatsServer]
+    tmp_path: Path, cluster: list[NatsServer], caplog: pytest.LogCaptureFixture
 ) -> None:
+    def told() -> list[dict[str, Any]]:
+        return [vars(each)["fields"] for each in caplog.records if "replicas" in each.message]
+
     file = configuration(tmp_path, servers=urls(cluster))
     with Appliance(load(file)) as appliance:
         write(appliance, 1, 7)
-        file = configuration(tmp_path, servers=urls(cluster), replicas=3)
+    assert not told()
+    file = configuration(tmp_path, servers=urls(cluster), replicas=3)
+    with Appliance(load(file)) as appliance:
+        assert told() == [{"log": "site", "replicas": 1, "configured": 3}]
+        assert appliance.replicas()["site"]["replicas"] == 1
         name = "holdfast-log-site"
         streams = [f"KV_{name}", f"OBJ_{name}", name, f"KV_{name}-leases"]
         assert done("log", "replicas", str(file)) == [f"{each}: 1 -> 3" for each in streams]
         assert done("log", "replicas", str(file)) == [f"{each}: 3" for each in streams]
+        wire.until(lambda: appliance.replicas()["site"]["replicas"] == 3, "the node sees it")
         write(appliance, 1, 8)
 
 

@@ -53,7 +53,8 @@ def test_a_connected_log_without_contact_is_not_well(monkeypatch: pytest.MonkeyP
     status: dict[str, Any] = {
         **{"phase": "running", "failure": None, "connected": True, "server": "127.0.0.1:4222"},
         **{"contact_age": 68.9, "obstacle": late, "last_error": reason, "embedded": None},
-        **{"node": "a", "nodes": nodes, "digest": [7, "0123456789abcdef", True], **counters},
+        **{"replicas": 1, "node": "a", "nodes": nodes},
+        **{"digest": [7, "0123456789abcdef", True], **counters},
         "devices": {},
     }
     monkeypatch.setattr(log_status, "ask", lambda *_: {"logs": {"site": status}})
@@ -96,7 +97,8 @@ def test_the_nodes_of_a_log_are_shown(node: RunCommand, server: NatsServer, tmp_
         assert (status["phase"], status["connected"], status["steps"]) == ("running", True, 1)
         assert (status["node"], status["obstacle"]) == ("scada-a", None)
         lines = invoke("log", "status", file).stdout.splitlines()
-        assert lines[0] == f"log site: running, connected to {server.url.removeprefix('nats://')}"
+        where = server.url.removeprefix("nats://")
+        assert lines[0] == f"log site: running, connected to {where}, replicas 1"
         assert lines[2] == "  writes of this node: 1 done, 0 not sent, 0 not confirmed"
         assert lines[3].split()[:3] == ["node", "last", "message"]
         assert lines[4].split()[0] == "scada-a"
@@ -104,7 +106,7 @@ def test_the_nodes_of_a_log_are_shown(node: RunCommand, server: NatsServer, tmp_
         wire.until(lambda: invoke("log", "status", file).exit_code == 3, "the log is away")
         assert connection.ask(bytes.fromhex("060003002b")) == bytes.fromhex("8606")
     lines = invoke("log", "status", file).stdout.splitlines()
-    assert lines[0] == "log site: running, not connected"
+    assert lines[0] == "log site: running, not connected, replicas 1"
     assert lines[2] == "  writes of this node: 1 done, 1 not sent, 0 not confirmed"
     assert lines[3] == "  not caught up: not connected"
     assert lines[4].startswith("  last error: ")

@@ -126,7 +126,8 @@ class SharedLogs(Part):
             raise LogNotJoined(f"logs.{name}: {error}", is_permanent=is_permanent) from None
         except ValueError as error:
             raise LogNotJoined(f"logs.{name}: {error}", is_permanent=True) from None
-        sequence, names = log.status()["sequence"], [each for each, _ in members]
+        status, names = log.status(), [each for each, _ in members]
+        sequence = status["sequence"]
         # The first message is that this node has joined. Nobody else writes an embedded log.
         if sequence > 1 and settings.embedded is None:
             self.restored.update(names)
@@ -138,6 +139,14 @@ class SharedLogs(Part):
             sequence=sequence,
             memories=",".join(names),
         )
+        if status["replicas"] != settings.replicas:  # It has those with which it was made.
+            log_lines.write(
+                logging.WARNING,
+                "log_replicas_differ",
+                log=name,
+                replicas=status["replicas"],
+                configured=settings.replicas,
+            )
         self._memories.follow(name, log)
         log_servers.begin(name, settings)
 

@@ -58,7 +58,7 @@ def _shown(name: str, status: dict[str, Any]) -> list[str]:
     where = f"connected to {plain(status['server'])}" if status["connected"] else "not connected"
     contact = status["contact_age"]
     lines = [
-        f"log {name}: {status['phase']}, {where}",
+        f"log {name}: {status['phase']}, {where}, replicas {status['replicas']}",
         f"  sequence {status['sequence']}, {status['lag']} behind the last known, "
         + ("no contact yet" if contact is None else f"contact {contact:.1f} s ago"),
         f"  writes of this node: {status['steps']} done, {status['unavailable']} not sent, "

@@ -30,6 +30,9 @@ use crate::log::stream::store::{DIGEST_KEY_PREFIX, SNAPSHOT_KEY, Store, parsed};
 /// The most further messages that are applied before steps are sent.
 const MAX_FURTHER_MESSAGES: usize = 255;
 
+/// How often to look on how many servers the stream is: an operator can change it while nodes run.
+const REPLICAS_INTERVAL: Duration = Duration::from_secs(5);
+
 /// The shortest heartbeat that a consumer is asked for.
 const MIN_HEARTBEAT: Duration = Duration::from_millis(200);
 
@@ -115,6 +118,8 @@ impl<'n> Session<'n> {
         self.announce().await?;
         let mut checks = tokio::time::interval(CHECK_INTERVAL);
         checks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let mut replicas = tokio::time::interval(REPLICAS_INTERVAL);
+        replicas.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             if messages.are_calm() {
                 self.consume(&mut messages).await?;
@@ -151,6 +156,9 @@ impl<'n> Session<'n> {
                     return Err(end);
                 }
                 _ = checks.tick() => self.check().await?,
+                _ = replicas.tick() => self.background.spawn(|store| async move {
+                    Report::Replicas(store.replicas().await)
+                }),
             }
         }
     }
@@ -305,6 +313,11 @@ impl<'n> Session<'n> {
             Report::NotStored { reason, known, found } => {
                 self.node.snapshotter.failed(&reason, known, found)?;
             }
+            Report::Replicas(Some(found)) => {
+                self.node.shared.update(|view| view.replicas = found);
+            }
+            // The next look does better.
+            Report::Replicas(None) => {}
             Report::Freed(freed) => self.node.snapshotter.freed(freed),
             Report::Replayed { sequence, digest } => self.replayed(sequence, digest)?,
         }

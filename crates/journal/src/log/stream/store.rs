@@ -203,6 +203,11 @@ impl Store {
         Ok(info.map_err(|error| End::lost("the stream of the log", error))?.state.last_sequence)
     }
 
+    /// On how many servers the stream is, if they say so.
+    pub(in crate::log) async fn replicas(&self) -> Option<usize> {
+        self.stream.get_info().await.ok().map(|info| info.config.num_replicas)
+    }
+
     /// The message at this sequence, if the stream has it.
     pub(in crate::log) async fn message(&self, sequence: u64) -> Result<Option<Received>, End> {
         let name = &self.stream.cached_info().config.name;
