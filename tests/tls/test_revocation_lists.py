@@ -120,6 +120,27 @@ def test_a_list_of_another_authority_of_the_same_name_does_not_count(
 
 
 @pytest.mark.parametrize("form", FORMS)
+def test_authorities_of_the_same_name_have_lists_of_their_own(
+    form: str, tmp_path: Path, run: Run
+) -> None:
+    """As after a renewal with a new key."""
+    plant, twin = (Plant(tmp_path / each, FORMS[form][0]) for each in ("plant", "twin"))
+    kept, lost = [each.client("kept") for each in (plant, twin)], twin.client("lost")
+    lists = plant.authority.revoke().read_bytes(), twin.authority.revoke(lost).read_bytes()
+    authorities = [each.authority.ca.read_bytes() for each in (plant, twin)]
+    plant.authority.ca.write_bytes(b"".join(authorities))
+    crl = tmp_path / "both.crl"
+    crl.write_bytes(b"".join(lists))
+    assert not any("clients" in str(each) for each in load_whole(plant.config(crl)).warnings)
+    appliance = run(plant.config(crl).read_text())
+    assert [plant.judged(appliance, each) for each in kept] == [("served", "served")] * 2
+    assert plant.judged(appliance, lost) == ("revoked", "revoked")
+    crl.write_bytes(lists[1])
+    none = "found no list of certificate 1 of ca_file (CN=plant): its clients are refused"
+    assert any(none in str(each) for each in load_whole(plant.config(crl)).warnings)
+
+
+@pytest.mark.parametrize("form", FORMS)
 def test_a_list_that_has_expired_refuses_clients(form: str, tmp_path: Path, run: Run) -> None:
     plant = Plant(tmp_path, FORMS[form][0])
     appliance = run(plant.config(plant.authority.revoke(dates=PAST)).read_text())

@@ -167,7 +167,8 @@ def test_a_list_of_an_authority_of_the_same_name_is_doubtful(
     twin = plant.joined("twin.crl", Certificates(folder, "plant").revoke())
     assert plant.warnings(crl_file=twin) == [
         "revocation list 1 (CN=plant) is not signed by the authority of that name in ca_file: "
-        "clients of that authority are refused"
+        "it does not count for the clients of that authority",
+        "found no list of certificate 1 of ca_file (CN=plant): its clients are refused",
     ]
     appliance = run(plant.config(crl_file=twin).read_text())
     assert verdict(appliance, plant.trust()).endswith("ALERT_UNKNOWN_CA")

@@ -4,7 +4,7 @@ use rustls::pki_types::{CertificateDer, UnixTime};
 use rustls::{CertificateError, ExtendedKeyPurpose};
 use webpki::KeyPurposeId;
 use x509_cert::certificate::{CertificateInner, Profile};
-use x509_cert::der::asn1::{AnyRef, ObjectIdentifier, UintRef, Utf8StringRef};
+use x509_cert::der::asn1::{AnyRef, BitString, ObjectIdentifier, UintRef, Utf8StringRef};
 use x509_cert::der::{self, Decode, Encode, Reader, SliceReader};
 use x509_cert::ext::pkix::{BasicConstraints, CrlDistributionPoints, ExtendedKeyUsage, KeyUsage};
 use x509_cert::name::Name;
@@ -12,7 +12,7 @@ use x509_cert::serial_number::SerialNumber;
 use x509_cert::spki::{AlgorithmIdentifierOwned, SubjectPublicKeyInfoOwned};
 
 use super::failure::TlsFailure;
-use super::provider::KEYS;
+use super::provider::{ALGORITHMS, KEYS};
 use super::rsa_pss;
 
 /// The extension that holds the role (MB-TCP-Security, 8.4).
@@ -241,6 +241,31 @@ impl Parsed {
     /// Whether its issuer is the subject of another certificate.
     pub(super) fn is_issued_by(&self, other: &Parsed) -> bool {
         other.has_subject(self.0.tbs_certificate().issuer())
+    }
+
+    /// Whether another certificate is its issuer, and has the key that signed it.
+    pub(super) fn is_signed_by(&self, other: &Parsed) -> bool {
+        let signed = self.0.tbs_certificate().to_der();
+        self.is_issued_by(other)
+            && signed.is_ok_and(|signed| {
+                other.has_signed(&signed, self.0.signature_algorithm(), self.0.signature())
+            })
+    }
+
+    /// Whether a signature is one of its key.
+    pub(super) fn has_signed(
+        &self,
+        content: &[u8],
+        by: &AlgorithmIdentifierOwned,
+        signature: &BitString,
+    ) -> bool {
+        let (with, of) = (algorithm_content(by), self.key_algorithm());
+        let key = self.key().subject_public_key.raw_bytes();
+        ALGORITHMS.all.iter().any(|algorithm| {
+            with.as_deref() == Some(algorithm.signature_alg_id().as_ref())
+                && of.as_deref() == Some(algorithm.public_key_alg_id().as_ref())
+                && algorithm.verify_signature(key, content, signature.raw_bytes()).is_ok()
+        })
     }
 
     pub(super) fn has_subject(&self, name: &Name) -> bool {

@@ -98,8 +98,8 @@ impl<'f> Doubts<'f> {
             }
             if is_named && !named().any(|(each, _)| list.is_signed_by(&each.parsed)) {
                 self.add(file, &format!(
-                    "{name} is not signed by the authority of that name in {ca_key}: clients of \
-                     that authority are refused"
+                    "{name} is not signed by the authority of that name in {ca_key}: it does not \
+                     count for the clients of that authority"
                 ));
             }
             self.of_age(file, list, &name);
@@ -113,7 +113,10 @@ impl<'f> Doubts<'f> {
             }
         }
         for (each, number) in authorities {
-            if !lists.iter().any(|list| each.parsed.has_subject(list.issuer())) {
+            let has_issued = |list: &List| {
+                each.parsed.has_subject(list.issuer()) && list.is_signed_by(&each.parsed)
+            };
+            if !lists.iter().any(has_issued) {
                 let subject = each.parsed.subject_text();
                 self.add(file, &format!(
                     "found no list of certificate {number} of {ca_key} ({subject}): its clients are \

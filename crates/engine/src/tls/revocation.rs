@@ -19,9 +19,8 @@ use x509_cert::ext::pkix::name::{DistributionPointName, GeneralName};
 use x509_cert::name::Name;
 use x509_cert::time::Time;
 
-use super::certificate::{AnySerial, Parsed, algorithm_content};
+use super::certificate::{AnySerial, Parsed};
 use super::files::FileError;
-use super::provider::ALGORITHMS;
 use super::server_files::ExpiredLists;
 
 /// The extensions that RFC 5280, 5.2 requires of every list. No judgement depends on them.
@@ -112,15 +111,8 @@ impl List {
 
     /// Whether an authority has signed it.
     pub(super) fn is_signed_by(&self, authority: &Parsed) -> bool {
-        let with = algorithm_content(&self.parsed.signature_algorithm);
-        let of = algorithm_content(&authority.key().algorithm);
-        let key = authority.key().subject_public_key.raw_bytes();
-        let signature = self.parsed.signature.raw_bytes();
-        ALGORITHMS.all.iter().any(|algorithm| {
-            with.as_deref() == Some(algorithm.signature_alg_id().as_ref())
-                && of.as_deref() == Some(algorithm.public_key_alg_id().as_ref())
-                && algorithm.verify_signature(key, &self.signed, signature).is_ok()
-        })
+        let CertificateList { signature_algorithm, signature, .. } = &self.parsed;
+        authority.has_signed(&self.signed, signature_algorithm, signature)
     }
 
     /// Whether the list is for a certificate: it has the same issuer, and the certificate is within its
@@ -190,39 +182,51 @@ impl Lists {
         let mut presented = None;
         for each in path.intermediate_certificates().rev() {
             let own = parsed(each)?;
-            let list = self.find_list(each, &own, false)?;
-            self.check_certificate(each, list, presented.as_ref(), listed, now)?;
+            let list = self.find_list(each, &own, false, presented.as_ref().unwrap_or(listed))?;
+            self.check_certificate(each, list, presented.as_ref(), now)?;
             presented = Some(own);
         }
         let end_entity: &Cert<'_> = path.end_entity();
-        let list = self.find_list(end_entity, &parsed(end_entity)?, true)?;
-        self.check_certificate(end_entity, list, presented.as_ref(), listed, now)
+        let issuer = presented.as_ref().unwrap_or(listed);
+        let list = self.find_list(end_entity, &parsed(end_entity)?, true, issuer)?;
+        self.check_certificate(end_entity, list, presented.as_ref(), now)
     }
 
-    /// Judges a listed certificate, which needs no list: the operator vouches for it. A list that
-    /// `is_signed` by its authority comes first. No signature can be checked if the authority is not listed.
+    /// Judges a listed certificate, which needs no list: the operator vouches for it. The list that its
+    /// authority has signed counts. If that is not among the listed `authorities`, or has signed none,
+    /// nobody knows whose lists those of its name are: any of them counts.
     ///
     /// # Errors
     /// It is revoked.
-    pub(super) fn judge_listed(
+    pub(super) fn judge_listed<'p>(
         &self,
         certificate: &Cert<'_>,
         parsed: &Parsed,
-        is_signed: impl Fn(&List) -> bool,
+        mut authorities: impl Iterator<Item = &'p Parsed>,
     ) -> Result<(), webpki::Error> {
         let is_for = |list: &&List| list.is_for(certificate, parsed, !parsed.has_ca_flag());
         let lists = || self.lists.iter().filter(is_for);
-        let list = lists().find(|list| is_signed(list)).or_else(|| lists().next());
-        list.map_or(Ok(()), |list| list.check(certificate))
+        // Nearly always: no signature is checked.
+        if lists().all(|list| list.check(certificate).is_ok()) {
+            return Ok(());
+        }
+        let authority = authorities.find(|each| parsed.is_signed_by(each));
+        let own = authority.and_then(|each| lists().find(|list| list.is_signed_by(each)));
+        own.map_or(Err(webpki::Error::CertRevoked), |list| list.check(certificate))
     }
 
+    /// The list of the issuer of a certificate. Another authority may have the same name: an earlier
+    /// or later one, with another key.
     fn find_list(
         &self,
         certificate: &Cert<'_>,
         parsed: &Parsed,
         is_end_entity: bool,
+        issuer: &Parsed,
     ) -> Result<&List, webpki::Error> {
-        let found = self.lists.iter().find(|list| list.is_for(certificate, parsed, is_end_entity));
+        let mut lists =
+            self.lists.iter().filter(|list| list.is_for(certificate, parsed, is_end_entity));
+        let found = lists.find(|list| list.is_signed_by(issuer));
         found.ok_or(webpki::Error::UnknownRevocationStatus)
     }
 
@@ -233,12 +237,8 @@ impl Lists {
         certificate: &Cert<'_>,
         list: &List,
         presented: Option<&Parsed>,
-        listed: &Parsed,
         now: UnixTime,
     ) -> Result<(), webpki::Error> {
-        if !list.is_signed_by(presented.unwrap_or(listed)) {
-            return Err(webpki::Error::InvalidCrlSignatureForPublicKey);
-        }
         if self.expired == ExpiredLists::Refuse
             && let Some(next_update) = list.ends().filter(|ends| now >= *ends)
         {
@@ -454,6 +454,33 @@ mod tests {
         assert_eq!(reason(&[revokes_none(&twin), revokes(&root)]), "revoked");
         // Nobody knows whose list it is: a client that may be revoked is refused.
         assert_eq!(reason(&[revokes(&twin)]), "revoked");
+    }
+
+    #[test]
+    fn authorities_of_the_same_name_have_lists_of_their_own() {
+        let authorities = [0; 2].map(|_| Owner::authority("root", None));
+        let [former, renewed] = &authorities;
+        let clients = authorities.each_ref().map(|by| Owner::new("leaf", Some(by), numbered(4)));
+        let listed: Vec<_> = authorities.iter().chain(&clients).collect();
+        let between = intermediate(former, &[]);
+        let below = Owner::new("below", Some(&between), numbered(6));
+        for write in [version_1, |by: &Owner, revoked: &[&Owner]| list(by, revoked, None)] {
+            let lists = [write(former, &[&clients[0]]), write(renewed, &[])];
+            let others = [write(former, &[]), write(renewed, &[&between])];
+            for order in [[0, 1], [1, 0]] {
+                let lists = order.map(|at| lists[at].clone());
+                for listed in [&listed[..2], &listed[..]] {
+                    let outcome = clients.each_ref().map(|each| judged_by(listed, &lists, &[each]));
+                    assert_eq!(outcome, ["revoked", ""]);
+                }
+                let mut lists = order.map(|at| others[at].clone()).to_vec();
+                lists.push(write(&between, &[]));
+                assert_eq!(judged_by(&[former, renewed, &between], &lists, &[&below]), "");
+            }
+            let outcome =
+                clients.each_ref().map(|each| judged_by(&listed[..2], &lists[..1], &[each]));
+            assert_eq!(outcome, ["revoked", "unknown_revocation"]);
+        }
     }
 
     #[test]

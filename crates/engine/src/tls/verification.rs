@@ -23,7 +23,7 @@ use super::certificate::{Parsed, Purpose};
 use super::failure::{TlsFailure, between};
 use super::files::{FileError, certificates};
 use super::provider::ALGORITHMS;
-use super::revocation::{List, Lists};
+use super::revocation::Lists;
 
 /// A trusted certificate.
 #[derive(Debug)]
@@ -109,16 +109,8 @@ impl Trust {
         parsed.has_supported_key().map_err(wrapped)?;
         parsed.is_valid_at(now)?;
         parsed.is_for(purpose)?;
-        if self.listed.iter().any(|listed| listed.certificate == *presented) {
-            let is_signed = |list: &List| {
-                let signs = |each: &Listed| {
-                    each.is_authority()
-                        && parsed.is_issued_by(&each.parsed)
-                        && list.is_signed_by(&each.parsed)
-                };
-                self.listed.iter().any(signs)
-            };
-            return self.lists.judge_listed(&end_entity, &parsed, is_signed).map_err(refused);
+        if let Some(listed) = self.listed.iter().find(|listed| listed.certificate == *presented) {
+            return self.judge_listed(listed).map_err(refused);
         }
         // An authority is not a device: its own certificate must be listed to be accepted as one.
         if parsed.has_ca_flag() {
@@ -129,6 +121,15 @@ impl Trust {
             return Err(wrapped(TlsFailure::WrongKeyUsage));
         }
         self.find_issuer(&Path { end_entity: &end_entity, intermediates, purpose, now })
+    }
+
+    /// # Errors
+    /// A listed certificate is revoked.
+    fn judge_listed(&self, listed: &Listed) -> Result<(), webpki::Error> {
+        let certificate = EndEntityCert::try_from(&listed.certificate)?;
+        let authorities = self.listed.iter().filter(|each| each.is_authority());
+        let authorities = authorities.map(|each| &each.parsed);
+        self.lists.judge_listed(&certificate, &listed.parsed, authorities)
     }
 
     /// Looks for an authority that issued the certificate.
@@ -233,9 +234,9 @@ fn refused(error: webpki::Error) -> Error {
         Found::CrlExpired { time, next_update } => {
             wrapped(TlsFailure::ExpiredRevocationList { ago: between(next_update, time) })
         }
-        Found::UnknownRevocationStatus
-        | Found::InvalidCrlSignatureForPublicKey
-        | Found::IssuerNotCrlSigner => CertificateError::UnknownRevocationStatus.into(),
+        Found::UnknownRevocationStatus | Found::IssuerNotCrlSigner => {
+            CertificateError::UnknownRevocationStatus.into()
+        }
         Found::InvalidSignatureForPublicKey => CertificateError::BadSignature.into(),
         Found::BadDer | Found::BadDerTime | Found::TrailingData(_) => {
             CertificateError::BadEncoding.into()
