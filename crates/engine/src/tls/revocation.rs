@@ -457,6 +457,49 @@ mod tests {
     }
 
     #[test]
+    fn clients_of_a_listed_authority_that_is_revoked_are_refused() {
+        let (root, other) = (Owner::authority("root", None), Owner::authority("other", None));
+        let between = intermediate(&root, &[]);
+        let leaf = Owner::new("leaf", Some(&between), numbered(4));
+        let own = version_1(&between, &[]);
+        let outcome = |listed: &[&Owner], revoked: Vec<u8>| {
+            let lists = [own.clone(), revoked];
+            [&[&leaf][..], &[&leaf, &between]].map(|chain| judged_by(listed, &lists, chain))
+        };
+        for listed in [&[&root, &between][..], &[&between]] {
+            assert_eq!(outcome(listed, version_1(&root, &[&between])), ["revoked"; 2]);
+            assert_eq!(outcome(listed, version_1(&root, &[])), [""; 2]);
+            assert_eq!(outcome(listed, version_1(&other, &[&between])), [""; 2]);
+        }
+        // The list of the authority does not matter, and neither does the order of the files.
+        let revoked = [version_1(&root, &[&between])];
+        assert_eq!(judged_by(&[&between, &root], &revoked, &[&leaf]), "revoked");
+        // A root that has revoked itself.
+        let root = Owner::new("root", None, |params| {
+            numbered(1)(params);
+            params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+        });
+        let leaf = Owner::new("leaf", Some(&root), numbered(4));
+        assert_eq!(judged(&root, &[version_1(&root, &[&root])], &[&leaf]), "revoked");
+    }
+
+    #[test]
+    fn an_authority_that_was_renewed_with_its_key_outlives_the_revoked_certificate() {
+        let root = Owner::authority("root", None);
+        let former = intermediate(&root, &[]);
+        let mut params = former.params.clone();
+        numbered(5)(&mut params);
+        let key = rcgen::KeyPair::from_pem(&former.key.serialize_pem()).unwrap();
+        let certificate = params.signed_by(&key, &root.issuer()).unwrap();
+        let renewed = Owner { certificate, params, key };
+        let leaf = Owner::new("leaf", Some(&former), numbered(4));
+        let lists = [version_1(&root, &[&former]), version_1(&renewed, &[])];
+        assert_eq!(judged_by(&[&former, &renewed], &lists, &[&leaf]), "");
+        assert_eq!(judged_by(&[&renewed, &former], &lists, &[&leaf]), "");
+        assert_eq!(judged_by(&[&former], &lists, &[&leaf]), "revoked");
+    }
+
+    #[test]
     fn authorities_of_the_same_name_have_lists_of_their_own() {
         let authorities = [0; 2].map(|_| Owner::authority("root", None));
         let [former, renewed] = &authorities;

@@ -154,7 +154,10 @@ impl Trust {
         let anchors = authorities.iter().filter_map(|listed| listed.anchor.as_ref());
         let anchors: Vec<TrustAnchor<'_>> = anchors.map(borrow_anchor).collect();
         let check = |verified: &VerifiedPath<'_>| {
-            let authority = is_allowed(verified, authorities)?;
+            let allowed = allowed(verified, authorities)?;
+            // Of two certificates with the same name and key, only one may be revoked.
+            let valid = allowed.into_iter().find(|listed| self.judge_listed(listed).is_ok());
+            let authority = valid.ok_or(webpki::Error::CertRevoked)?;
             self.lists.judge(verified, &authority.parsed, path.now)
         };
         path.end_entity.verify_for_usage(
@@ -197,11 +200,12 @@ fn borrow_anchor<'a>(anchor: &'a TrustAnchor<'static>) -> TrustAnchor<'a> {
 }
 
 /// The rules along a path that webpki does not check: which certificates are authorities, and the
-/// `pathLenConstraint` of a listed one. Returns the listed authority at the end of the path.
-fn is_allowed<'l>(
+/// `pathLenConstraint` of a listed one. Returns the listed authorities at the end of the path, which
+/// have the same name and key.
+fn allowed<'l>(
     path: &VerifiedPath<'_>,
     authorities: &[&'l Listed],
-) -> Result<&'l Listed, webpki::Error> {
+) -> Result<Vec<&'l Listed>, webpki::Error> {
     let mut len = 0;
     for intermediate in path.intermediate_certificates() {
         let parsed = Parsed::new(&intermediate.der()).map_err(|_| webpki::Error::BadDer)?;
@@ -220,8 +224,11 @@ fn is_allowed<'l>(
     let fits = |listed: &&Listed| {
         listed.parsed.max_intermediates().is_none_or(|most| len <= usize::from(most))
     };
-    let found = authorities.iter().filter(is_anchor).find(|listed| fits(listed));
-    found.copied().ok_or(webpki::Error::PathLenConstraintViolated)
+    let found: Vec<_> = authorities.iter().filter(is_anchor).copied().filter(fits).collect();
+    match found.is_empty() {
+        true => Err(webpki::Error::PathLenConstraintViolated),
+        false => Ok(found),
+    }
 }
 
 /// Converts an error of webpki. The presented certificate has already passed the checks of its
