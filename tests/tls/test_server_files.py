@@ -124,7 +124,7 @@ def test_a_list_that_has_expired_is_doubtful_and_refuses_clients(
     assert warning.startswith("revocation list 1 (CN=plant) expired ")
     assert warning.endswith(" days ago: clients of that authority are refused")
     appliance = run(plant.config(crl_file=crl).read_text())
-    assert verdict(appliance, plant.trust()).endswith("ALERT_UNKNOWN_CA")
+    assert verdict(appliance, plant.trust()).endswith("ALERT_CERTIFICATE_UNKNOWN")
     assert reasons(appliance, caplog) == ["expired_revocation_list"]
 
 
@@ -155,7 +155,7 @@ def test_lists_of_others_and_authorities_without_a_list_are_doubtful(
         "found no list of certificate 1 of ca_file (CN=plant): its clients are refused",
     ]
     appliance = run(plant.config(crl_file=other).read_text())
-    assert verdict(appliance, plant.trust()).endswith("ALERT_UNKNOWN_CA")
+    assert verdict(appliance, plant.trust()).endswith("ALERT_CERTIFICATE_UNKNOWN")
     assert reasons(appliance, caplog) == ["unknown_revocation"]
 
 
@@ -171,7 +171,7 @@ def test_a_list_of_an_authority_of_the_same_name_is_doubtful(
         "found no list of certificate 1 of ca_file (CN=plant): its clients are refused",
     ]
     appliance = run(plant.config(crl_file=twin).read_text())
-    assert verdict(appliance, plant.trust()).endswith("ALERT_UNKNOWN_CA")
+    assert verdict(appliance, plant.trust()).endswith("ALERT_CERTIFICATE_UNKNOWN")
     assert reasons(appliance, caplog) == ["unknown_revocation"]
 
 

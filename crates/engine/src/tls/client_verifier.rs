@@ -132,9 +132,7 @@ fn refused(failure: &TlsFailure) -> Error {
         | TlsFailure::IssuerExpired { .. }
         | TlsFailure::IssuerNotYetValid { .. } => CertificateError::Expired,
         TlsFailure::Revoked => CertificateError::Revoked,
-        TlsFailure::UnknownIssuer
-        | TlsFailure::UnknownRevocation
-        | TlsFailure::ExpiredRevocationList { .. } => CertificateError::UnknownIssuer,
+        TlsFailure::UnknownIssuer => CertificateError::UnknownIssuer,
         TlsFailure::WrongPurpose { .. }
         | TlsFailure::WrongKeyUsage
         | TlsFailure::UnsupportedCertificate { .. } => CertificateError::InvalidPurpose,
