@@ -11,7 +11,7 @@ use rustls::pki_types::{CertificateRevocationListDer, UnixTime};
 use webpki::{Cert, CertRevocationList, OwnedCertRevocationList, VerifiedPath};
 use x509_cert::certificate::Version;
 use x509_cert::crl::{CertificateList, TbsCertList};
-use x509_cert::der::asn1::{ContextSpecific, ObjectIdentifier, OctetString};
+use x509_cert::der::asn1::{ContextSpecific, ObjectIdentifier, OctetString, Uint};
 use x509_cert::der::{self, Decode, Encode, Reader, SliceReader, TagNumber};
 use x509_cert::ext::Extension;
 use x509_cert::ext::pkix::IssuingDistributionPoint;
@@ -66,7 +66,7 @@ impl List {
             })
         });
         let mut lists = lists.collect::<Result<Vec<_>, FileError>>()?;
-        lists.sort_by_key(|list| std::cmp::Reverse(list.begins()));
+        lists.sort_by_key(|list| std::cmp::Reverse((list.begins(), list.crl_number())));
         Ok(lists)
     }
 
@@ -102,11 +102,20 @@ impl List {
         self.parsed.tbs_cert_list.next_update.as_ref().map(unix_time)
     }
 
+    /// A later list of the same authority has a higher one.
+    fn crl_number(&self) -> Option<Uint> {
+        Uint::from_der(self.extension(CRL_NUMBER)?.extn_value.as_bytes()).ok()
+    }
+
     /// The required extensions that it lacks, in words.
     pub(super) fn missing(&self) -> Vec<&'static str> {
-        let found = self.parsed.tbs_cert_list.crl_extensions.as_deref().unwrap_or_default();
-        let lacks = |(id, _): &(ObjectIdentifier, _)| found.iter().all(|each| each.extn_id != *id);
+        let lacks = |(id, _): &(ObjectIdentifier, _)| self.extension(*id).is_none();
         REQUIRED.into_iter().filter(lacks).map(|(_, name)| name).collect()
+    }
+
+    fn extension(&self, id: ObjectIdentifier) -> Option<&Extension> {
+        let found = self.parsed.tbs_cert_list.crl_extensions.as_deref().unwrap_or_default();
+        found.iter().find(|each| each.extn_id == id)
     }
 
     /// Whether an authority has signed it.
@@ -314,7 +323,7 @@ mod tests {
     use super::*;
     use crate::tls::TlsFailure;
     use crate::tls::certificate::Purpose;
-    use crate::tls::test_party::{Owner, revocations};
+    use crate::tls::test_party::{Folder, Owner, revocations};
     use crate::tls::verification::{Listed, Trust};
 
     /// Within the dates of every certificate and list.
@@ -389,6 +398,27 @@ mod tests {
             assert_eq!(reason(std::slice::from_ref(&between_has)), "unknown_revocation");
             assert_eq!(reason(&[revoked[0].clone(), between_has]), "revoked");
             assert_eq!(reason(&[root_has, revoked[1].clone()]), "revoked");
+        }
+    }
+
+    #[test]
+    fn of_lists_from_the_same_second_the_higher_number_counts() {
+        let root = Owner::authority("root", None);
+        let numbered = |number: u64| {
+            let list = rcgen::CertificateRevocationListParams {
+                this_update: rcgen::date_time_ymd(2026, 1, 1),
+                next_update: rcgen::date_time_ymd(2090, 1, 1),
+                crl_number: number.into(),
+                issuing_distribution_point: None,
+                revoked_certs: Vec::new(),
+                key_identifier_method: rcgen::KeyIdMethod::Sha256,
+            };
+            list.signed_by(&root.issuer()).unwrap().pem().unwrap()
+        };
+        let folder = Folder::new();
+        for (numbers, newest) in [([255, 256], 2), ([256, 255], 1), ([9, 127], 2)] {
+            let file = folder.write("lists.pem", &numbers.map(numbered).concat());
+            assert_eq!(List::of_file(&file).unwrap()[0].number, newest);
         }
     }
 
