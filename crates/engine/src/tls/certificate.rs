@@ -326,7 +326,7 @@ pub(super) fn name_text(name: &Name) -> String {
 }
 
 /// The content of an algorithm identifier.
-pub(super) fn algorithm_content(algorithm: &AlgorithmIdentifierOwned) -> Option<Vec<u8>> {
+fn algorithm_content(algorithm: &AlgorithmIdentifierOwned) -> Option<Vec<u8>> {
     let der = algorithm.to_der().ok()?;
     AnyRef::from_der(&der).ok().map(|sequence| sequence.value().to_vec())
 }
