@@ -231,6 +231,55 @@ def test_a_file_that_begins_with_a_torn_line_is_tied_to_the_one_before(
     assert verify([log, before]).error == f"{before}:10: changed"
 
 
+def broken(log: Path, reason: str) -> list[bytes]:
+    """The lines of a log whose line 11 reports a break before which nothing is missing."""
+    whole = log.read_bytes()
+    if reason == "missing":
+        log.rename(log.with_name("audit.log.1"))
+    audit = Audit(log, max_bytes=65536, keep=1)
+    if reason == "deleted":
+        log.unlink()
+    if reason == "changed":
+        log.write_bytes(whole + garbled(b""))
+    audit.write(number=12)
+    audit.close()
+    own = log.read_bytes().removeprefix(whole + garbled(b""))
+    log.write_bytes(whole + own)
+    assert (verify([log]).error, verify([log]).breaks) == (None, {reason: 1})
+    return log.read_bytes().splitlines(keepends=True)
+
+
+@pytest.mark.parametrize("reason", ["changed", "deleted", "missing"])
+def test_the_line_before_a_break_is_protected_if_nothing_is_missing(log: Path, reason: str) -> None:
+    lines = broken(log, reason)
+    log.write_bytes(b"".join(changed(lines, 9, forged)))
+    assert verify([log]).error == f"{log}:10: changed"
+    log.write_bytes(b"".join([*lines[:11], *lines[10:]]))
+    assert verify([log]).error is not None
+
+
+@pytest.mark.parametrize("reason", ["changed", "deleted"])
+def test_an_altered_copy_before_a_break_is_found(log: Path, reason: str) -> None:
+    lines = broken(log, reason)
+    log.write_bytes(b"".join([*lines[:10], spaced(lines[10]), *lines[10:]]))
+    assert verify([log]).error == f"{log}:11: inserted"
+
+
+@pytest.mark.parametrize("reason", ["changed", "deleted", "missing"])
+def test_lines_may_be_missing_before_a_break(log: Path, reason: str) -> None:
+    lines = broken(log, reason)
+    log.write_bytes(b"".join([*lines[:7], *lines[10:]]))
+    assert (verify([log]).error, verify([log]).breaks) == (None, {reason: 1})
+
+
+def test_copies_have_the_lines_of_a_file_that_went_missing(log: Path) -> None:
+    lines = broken(log, "missing")
+    copied = lines[9].replace(b'"seq":10,"prev":"', b'"seq":11,"prev":"')
+    copied = copied.replace(json.loads(copied)["prev"].encode(), digest_of(lines[9]).encode())
+    log.write_bytes(b"".join([*lines[:10], copied, *lines[10:]]))
+    assert (verify([log]).error, verify([log]).breaks) == (None, {"missing": 1})
+
+
 def test_an_incomplete_last_line_is_a_gap(log: Path) -> None:
     log.write_bytes(log.read_bytes()[:-5])
     assert asked(log).exit_code == 3

@@ -158,16 +158,26 @@ def _error(
         return None
     if line.says("torn"):
         return _torn(before_that, before, line, line.place)
-    if line.place.broken is not None:
-        return None
     if line.place.prev == before.digest:
         expected = before.seq + 1
         return (
             None if line.seq == expected else f"{line}: changed: seq is {line.seq}, not {expected}"
         )
+    if _may_lack_lines(before, line, line.place):
+        return None
     if before_that is not None and line.place.prev == before_that.digest:
         return f"{before}: inserted"
     return _broken(findings.files, before, line, after)
+
+
+def _may_lack_lines(before: Line, line: Line, place: Place) -> bool:
+    """Whether a line reports that the line that it names is not there."""
+    if place.broken in (None, "torn") or line.data == before.data:
+        return False
+    if place.broken in ("changed", "deleted"):
+        return place.seq > before.seq + 1
+    # Copies have the lines of a file that went missing, and lack a line without a place.
+    return place.seq != before.seq + 1
 
 
 def _torn(whole: Line | None, torn: Line, line: Line, place: Place) -> str | None:
