@@ -240,6 +240,26 @@ def test_a_receiver_that_takes_nothing_gets_few_requests(database: Database) -> 
     output.close()
 
 
+@pytest.mark.parametrize("shown", ["Authorization: {}", "x" * 190 + "{}"])
+def test_an_answer_that_repeats_the_credentials_is_shown_without_them(
+    database: Database, tmp_path: Path, shown: str
+) -> None:
+    (tmp_path / "s").write_text("one-secret\n")
+    file = str(tmp_path / "s")
+    database.status = 401
+    for credentials, header in (
+        ({"bucket": "b", "token_file": file}, "Token one-secret"),
+        ({"username": "me", "password_file": file}, "Basic bWU6b25lLXNlY3JldA=="),
+        ({"username": "me", "password_file": file}, "me:one-secret"),
+    ):
+        database.answer = shown.format(header).encode()
+        output = influx(f"{database.url}/write", **credentials)
+        with pytest.raises(OSError, match=r"HTTP 401: .*\*\*\*") as refused:
+            output.send(numbered(1))
+        output.close()
+        assert not any(part in str(refused.value) for part in ("one-", "bWU6"))
+
+
 @pytest.mark.parametrize("says_so", [False, True])
 def test_a_connection_that_was_closed_meanwhile_is_opened_again(
     database: Database, says_so: bool, monkeypatch: pytest.MonkeyPatch

@@ -52,6 +52,8 @@ class Influx(Receiver):
         self._has_ended = self._is_late = False
         self._refused: set[tuple[str, str]] = set()
         """Devices and tags whose last values were refused, each by itself."""
+        self._secrets: list[str] = []
+        """What no message may repeat, of the last request."""
         self._path = self._target.path
         if self._path in ("", "/"):
             query = {"org": settings.org, "bucket": settings.bucket, "precision": "ns"}
@@ -104,7 +106,11 @@ class Influx(Receiver):
         if not body:
             return 204, ""
         status, answer = self._answer(body)
-        text = answer.decode("utf-8", "replace").strip()[:MAX_SHOWN_CHARS]
+        text = answer.decode("utf-8", "replace").strip()
+        for secret in filter(None, self._secrets):
+            # Some receivers, and proxies before them, repeat the headers that they got.
+            text = text.replace(secret, "***")
+        text = text[:MAX_SHOWN_CHARS]
         message = f"{self._at}: HTTP {status}{': ' if text else ''}{text}"
         if 200 <= status < 300 or status in UNWANTED:
             return status, message
@@ -204,10 +210,13 @@ class Influx(Receiver):
             token = read_secret(settings.token_file).strip()
             if not (token.isascii() and token.isprintable()):
                 raise OSError(f"{settings.token_file} is not one line of printable ASCII")
+            self._secrets = [token]
             return {"Authorization": f"Token {token}"}
         if settings.username is not None and settings.password_file is not None:
-            pair = f"{settings.username}:{read_secret(settings.password_file).strip()}"
-            return {"Authorization": f"Basic {base64.b64encode(pair.encode()).decode()}"}
+            password = read_secret(settings.password_file).strip()
+            pair = base64.b64encode(f"{settings.username}:{password}".encode()).decode()
+            self._secrets = [pair, password]
+            return {"Authorization": f"Basic {pair}"}
         return {}
 
 
