@@ -107,7 +107,7 @@ def test_modbus_writes_are_audited_with_their_values(
             "values": [1],
             "outcome": "illegal_data_address",
         },
-        {**scada, "function": 16, "outcome": "illegal_data_value"},
+        {**scada, "function": 16, "pdu": "10000200000400070008", "outcome": "illegal_data_value"},
         {
             "listener": "scada",
             "unit": 9,

@@ -1109,6 +1109,7 @@ def test_what_is_passed_on_is_in_the_audit_log(
         exception(asked.pdu, 0x63) if asked.pdu[:1] == b"\x10" else asked.pdu
     )
     many = bytes.fromhex("100005000102 0001")
+    refused = [bytes.fromhex(pdu) for pdu in ("420102", "0800010000", "2b0d00")]
     appliance = run(
         configuration(
             device.url,
@@ -1119,12 +1120,12 @@ def test_what_is_passed_on_is_in_the_audit_log(
         )
     )
     with client(kind, scada(appliance)) as front:
-        for pdu in (WRITE, many, VENDOR, READ, bytes.fromhex("0500050000")):
+        for pdu in (WRITE, many, VENDOR, READ, bytes.fromhex("0500050000"), *refused):
             front.ask(pdu, 5)
 
     found = [
         {key: value for key, value in line.items() if key not in ("time", "peer", "listener")}
-        for line in await_writes(tmp_path / "audit.log", 4)
+        for line in await_writes(tmp_path / "audit.log", 7)
     ]
     register = {"area": "holding_registers", "address": 5}
     assert found[0] == {
@@ -1142,7 +1143,10 @@ def test_what_is_passed_on_is_in_the_audit_log(
     assert found[3]["function"] == 5
     assert found[3]["outcome"] == "illegal_function"
     assert "route" not in found[3]
-    assert len(found) == 4
+    assert found[4:] == [
+        {"unit": 5, "function": pdu[0], "pdu": pdu.hex(), "outcome": "illegal_function"}
+        for pdu in refused
+    ]
 
 
 @pytest.mark.parametrize("is_ended", [False, True])

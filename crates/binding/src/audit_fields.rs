@@ -55,7 +55,7 @@ pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, P
             if let Some(memory) = memory {
                 line.set_item("memory", &**memory)?;
             }
-            request(&line, pdu, route.is_some())?;
+            request(&line, pdu)?;
             line.set_item("outcome", refused.map_or_else(|| "done".into(), exception))?;
         }
         Written::Packet { format, header, payload, refused } => {
@@ -75,9 +75,8 @@ pub fn to_python<'py>(py: Python<'py>, record: &Record) -> PyResult<Bound<'py, P
     Ok(line)
 }
 
-/// Adds area, address and values of a Modbus request. A request that memories do not know adds its PDU
-/// if it was passed on to a device, otherwise nothing.
-fn request(line: &Bound<'_, PyDict>, pdu: &[u8], passed_on: bool) -> PyResult<()> {
+/// Adds area, address and values of a Modbus request, or the PDU if memories do not know the request.
+fn request(line: &Bound<'_, PyDict>, pdu: &[u8]) -> PyResult<()> {
     let (area, address, values) = match Request::parse(pdu) {
         Ok(Request::WriteSingleCoil { address, value }) => {
             (Area::Coils, address, vec![u16::from(value)])
@@ -111,11 +110,10 @@ fn request(line: &Bound<'_, PyDict>, pdu: &[u8], passed_on: bool) -> PyResult<()
             }
             return line.set_item("records", records);
         }
-        _ if passed_on => {
+        _ => {
             let hex: String = pdu.iter().map(|byte| format!("{byte:02x}")).collect();
             return line.set_item("pdu", hex);
         }
-        _ => return Ok(()),
     };
     line.set_item("area", area.name())?;
     line.set_item("address", address)?;
