@@ -15,7 +15,7 @@ from holdfast.events import log_lines
 from holdfast.events.rotation import Rotation
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.sending import Receiver
-from holdfast.tags.text import csv_line, plain, text_of
+from holdfast.tags.text import csv_lines, plain, text_of
 
 if TYPE_CHECKING:
     import io
@@ -160,8 +160,8 @@ def _csv(readings: list[Reading]) -> bytes:
     for reading in readings:
         time, device, tag, _, unit, error = row(reading)
         value = text_of(reading.tag, reading.value, states=False)
-        found.append(csv_line((time, device, tag, value, unit, error)))
-    return "".join(found).encode()
+        found.append((time, device, tag, value, unit, error))
+    return csv_lines(found).encode()
 
 
 def _json_lines(readings: list[Reading]) -> bytes:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import csv
-import io
 import math
 import re
 from fractions import Fraction
@@ -75,11 +74,18 @@ def text_of(tag: Tag, value: Any, *, states: bool = True) -> str:
     return str(value)
 
 
-def csv_line(cells: Iterable[object]) -> str:
-    """Cells as a line of CSV, which ends with a newline."""
-    text = io.StringIO()
-    csv.writer(text).writerow(cells)  # Its own end of line, so that it quotes "\r" and "\n".
-    return text.getvalue().removesuffix("\r\n") + "\n"
+def csv_lines(rows: Iterable[Iterable[object]]) -> str:
+    """Rows of cells as lines of CSV, each of which ends with a newline."""
+    lines = _Lines()
+    csv.writer(lines).writerows(rows)  # Its own end of line, so that it quotes "\r" and "\n".
+    return "".join(lines)
+
+
+class _Lines(list[str]):
+    """Takes the lines of a CSV writer, one at a time."""
+
+    def write(self, line: str) -> None:
+        self.append(line.removesuffix("\r\n") + "\n")
 
 
 def value_from(tag: Tag, text: str, *, states: bool = True) -> Any:

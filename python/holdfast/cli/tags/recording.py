@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.cli import terminal_text
 from holdfast.events import log_lines
-from holdfast.tags.text import csv_line, text_of
+from holdfast.tags.text import csv_lines, text_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -33,7 +33,7 @@ class NotARecording(ValueError):
 
 def head(tags: Iterable[Tag]) -> str:
     """The line with the names of the columns."""
-    return csv_line(["time", *(tag.name for tag in tags)])
+    return csv_lines([["time", *(tag.name for tag in tags)]])
 
 
 def row(moment: float, readings: Sequence[Reading], *, is_shown: bool = False) -> str:
@@ -45,7 +45,7 @@ def row(moment: float, readings: Sequence[Reading], *, is_shown: bool = False) -
     cells = [text_of(each.tag, each.value, states=False) for each in readings]
     if is_shown:
         cells = [terminal_text.plain(cell) for cell in cells]
-    return csv_line([log_lines.timestamp(moment), *cells])
+    return csv_lines([[log_lines.timestamp(moment), *cells]])
 
 
 class Recording:
