@@ -264,7 +264,7 @@ def test_a_recorded_text_is_played_back(
         result = invoke(*arguments)
         assert (result.exit_code, result.stderr) == (0, "")
     assert invoke(*arguments[:4], "--csv").stdout.count(text.replace('"', '""')) == 1
-    assert playback.load(record, load_tags(file)) == {"t": [text, text]}
+    assert playback.load(record, load_tags(file)).values == {"t": [text, text]}
 
 
 def test_an_item_has_the_form_that_write_takes(
@@ -294,7 +294,7 @@ def test_recorded_states_are_played_back_whatever_their_names(
     assert invoke(*arguments).exit_code == 0
     with record.open("a") as rows:
         rows.write("later,0,0.5,false\n")
-    found = playback.load(record, load_tags(file))
+    found = playback.load(record, load_tags(file)).values
     assert found == {"gear": [1, 0], "half": [1, 0.5], "valve": [True, False]}
 
 

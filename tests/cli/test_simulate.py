@@ -168,3 +168,19 @@ def test_an_address_in_use_is_told(simulate: Callable[..., tuple[ServingCommand,
 )
 def test_wrong_usage_is_told(arguments: tuple[str, ...], told: str) -> None:
     assert told in usage_error("simulate", HEATER, *arguments)
+
+
+@pytest.mark.parametrize("writable", ["", ", writable: true"])
+def test_a_value_that_does_not_fit_with_its_scale_is_told_with_its_line(
+    tmp_path: Path, writable: str
+) -> None:
+    tags, file = tmp_path / "tags.yaml", tmp_path / "values.csv"
+    tags.write_text(
+        "tags:\n"
+        "  power: {area: holding_registers, address: 0, type: int16, unit: W, "
+        f"scale: {{from: sf, as: exponent}}{writable}}}\n"
+        "  sf: {area: holding_registers, address: 4, type: int16}\n"
+    )
+    file.write_text("time,power,sf\n\n0,300000,0\n")
+    told = usage_error("simulate", str(tags), "--play", str(file))
+    assert f"{file}:3: power holds " in told

@@ -301,7 +301,7 @@ def test_values_are_played_back_and_begin_again(tmp_path: Path) -> None:
     )
     file = tmp_path / "values.csv"
     file.write_text('time,t,door,pair\n1,21.5,true,"[1,2]"\n2,,false,"[3,4]"\n')
-    device = SimulatedDevice(tags, played=playback.load(file, tags))
+    device = SimulatedDevice(tags, played=playback.load(file, tags).values)
     found = []
     for _ in range(3):
         found.append(device.memory.read("holding_registers", 0, 3))
@@ -320,7 +320,7 @@ def test_infinity_is_played_back_and_null_in_an_array_repeats_its_item(tmp_path:
     )
     file = tmp_path / "values.csv"
     file.write_text('flow,loss,pair\n1.5,inf,"[1,null]"\n-inf,-1,"[null,2]"\n,,\n')
-    device = SimulatedDevice(tags, played=playback.load(file, tags))
+    device = SimulatedDevice(tags, played=playback.load(file, tags).values)
     found = []
     for _ in range(3):
         floats = values.decode(device.memory.read("input_registers", 0, 4), "float32[2]")
@@ -338,7 +338,7 @@ def test_a_state_is_played_back_by_its_name(tmp_path: Path) -> None:
     )
     file = tmp_path / "values.csv"
     file.write_text("mode,relay\neco,off\n2,on\n")
-    device = SimulatedDevice(tags, played=playback.load(file, tags))
+    device = SimulatedDevice(tags, played=playback.load(file, tags).values)
     found = []
     for _ in range(2):
         found.append(
@@ -515,7 +515,7 @@ def test_rows_without_a_valid_scale_are_played(tmp_path: Path) -> None:
     file = tmp_path / "recorded.csv"
     file.write_text("time,power,sf\n0,,-32768\n1,300,0\n2,,-32768\n")
     tags = scaled_tags()
-    device = SimulatedDevice(tags, played=playback.load(file, tags))
+    device = SimulatedDevice(tags, played=playback.load(file, tags).values)
     found = []
     for _ in range(3):
         found.append(device.memory.read("holding_registers", 0, 5)[::4])
@@ -524,8 +524,9 @@ def test_rows_without_a_valid_scale_are_played(tmp_path: Path) -> None:
 
 
 def test_a_played_value_that_does_not_fit_with_its_scale_names_its_row() -> None:
-    with pytest.raises(Refused, match="row 2 of the values: power holds -32768 to 32767 W"):
+    with pytest.raises(Refused, match="power holds -32768 to 32767 W") as caught:
         SimulatedDevice(scaled_tags(), played={"power": [300, 300_000], "sf": [1, 0]})
+    assert caught.value.row == 1
 
 
 def test_a_written_scale_is_that_of_the_next_values(serve_simulated: Any) -> None:

@@ -11,7 +11,7 @@ from holdfast import values
 from holdfast._core import Memory, Rule
 from holdfast.simulation import generators
 from holdfast.simulation.capacity import Capacity, nearest
-from holdfast.simulation.scales import Scales
+from holdfast.simulation.scales import RowDoesNotFit, Scales
 from holdfast.tags.scale import RegisterScale
 from holdfast.types import AREAS
 from holdfast.values import DoesNotFit
@@ -28,9 +28,11 @@ if TYPE_CHECKING:
 class Refused(ValueError):
     """Values that a tag can't have."""
 
-    def __init__(self, tag: str, message: str) -> None:
-        super().__init__(tag, message)
+    def __init__(self, tag: str, message: str, row: int | None = None) -> None:
+        super().__init__(tag, message, row)
         self.tag, self.message = tag, message
+        self.row = row
+        """The row of a value that is played, from 0."""
 
     def __str__(self) -> str:
         return self.message
@@ -139,6 +141,8 @@ class SimulatedDevice:
                 self._counted[tag.name] = 0
             else:
                 self._scales.check(tag, found.ends)
+        except RowDoesNotFit as error:
+            raise Refused(tag.name, str(error), error.row) from None
         except DoesNotFit as error:
             raise Refused(tag.name, str(error)) from None
         except ValueError as error:
@@ -168,7 +172,8 @@ class SimulatedDevice:
             try:
                 self._scales.check(tag, [value])
             except DoesNotFit as error:
-                raise Refused(tag.name, str(error)) from None
+                row = None if played is None else 0
+                raise Refused(tag.name, str(error), row) from None
         whole = tag.of_type.count is None or isinstance(value, list)
         self._put(tag, value if whole else [value] * (tag.of_type.count or 1))
 

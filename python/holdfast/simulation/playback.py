@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 from itertools import chain, repeat
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast.simulation.capacity import Capacity
 from holdfast.tags.strict_text import from_text
@@ -29,7 +29,16 @@ class Unplayable(ValueError):
     """The file can't be played back."""
 
 
-def load(path: Path, tags: TagList) -> dict[str, list[Any]]:
+class Played(NamedTuple):
+    """What a file has: an item for each row."""
+
+    values: dict[str, list[Any]]
+    """By the names of tags."""
+    lines: list[int]
+    """Their numbers in the file."""
+
+
+def load(path: Path, tags: TagList) -> Played:
     """Reads the values of each tag. An empty cell repeats the value before, as does a null
     in an array for its item.
 
@@ -42,7 +51,7 @@ def load(path: Path, tags: TagList) -> dict[str, list[Any]]:
             raise Unplayable(f"{path}: not CSV: {error}") from error
 
 
-def _columns(rows: Any, file: str, tags: TagList) -> dict[str, list[Any]]:
+def _columns(rows: Any, file: str, tags: TagList) -> Played:
     names = next(rows, None)
     if names is None:
         raise Unplayable(f"{file}: the file is empty")
@@ -52,6 +61,7 @@ def _columns(rows: Any, file: str, tags: TagList) -> dict[str, list[Any]]:
     found: dict[str, list[Any]] = {name: [] for name in names if name != TIME}
     if len(found) < len(names) - names.count(TIME):
         raise Unplayable(f"{file}:1: two columns have the same name")
+    lines: list[int] = []
     capacities = {name: Capacity(tags[name]) for name in found if tags[name].source is None}
     for row in rows:
         if not row:
@@ -59,12 +69,13 @@ def _columns(rows: Any, file: str, tags: TagList) -> dict[str, list[Any]]:
         where = f"{file}:{rows.line_num}"
         if len(row) != len(names):
             raise Unplayable(f"{where}: found {len(row)} cells, allowed: {len(names)}")
-        if len(next(iter(found.values()), ())) == MAX_ROWS:
+        if len(lines) == MAX_ROWS:
             raise Unplayable(f"{where}: more than {MAX_ROWS} rows")
+        lines.append(rows.line_num)
         _take(found, zip(names, row, strict=True), where, tags, capacities)
     if not any(found.values()):
         raise Unplayable(f"{file}: no values")
-    return found
+    return Played(found, lines)
 
 
 def _take(

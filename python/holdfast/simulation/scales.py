@@ -22,6 +22,14 @@ AROUND_ZERO = (-1, 0, 1)
 """The whole numbers with which a scale is smallest, or the value is none."""
 
 
+class RowDoesNotFit(DoesNotFit):
+    """A value that is played. The first row is 0."""
+
+    def __init__(self, message: str, row: int) -> None:
+        super().__init__(message)
+        self.row = row
+
+
 class Scales:
     """What registers that contain scales will contain. `content` decodes what one contains now.
 
@@ -54,7 +62,7 @@ class Scales:
     def check_played(self, tag: Tag, values: Sequence[Any]) -> None:
         """The same for values that are played. A scale that is played belongs to one row.
 
-        The message has the row.
+        Raises `RowDoesNotFit`.
         """
         source = tag.source
         rows = None if source is None else self._rows.get((source.area, source.address))
@@ -63,12 +71,12 @@ class Scales:
         else:
             by_content = {each: self._capacities([each], tag) for each in dict.fromkeys(rows)}
             of_rows = [by_content[content] for content in rows]
-        for row, (value, capacities) in enumerate(zip(values, of_rows, strict=True), 1):
+        for row, (value, capacities) in enumerate(zip(values, of_rows, strict=True)):
             for capacity in capacities:
                 try:
                     capacity.check(value)
                 except DoesNotFit as error:
-                    raise DoesNotFit(f"row {row} of the values: {error}") from None
+                    raise RowDoesNotFit(str(error), row) from None
 
     def within(self, tag: Tag) -> tuple[float, float]:
         """The range that registers of a number can hold with all of the scales."""

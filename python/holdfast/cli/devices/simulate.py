@@ -155,7 +155,7 @@ def _device(
 ) -> SimulatedDevice:
     """Raises `click.UsageError` for what the tags can't do."""
     try:
-        played = {} if play is None else playback.load(play, tags)
+        played = playback.Played({}, []) if play is None else playback.load(play, tags)
     except OSError as error:
         raise click.UsageError(f"{play}: {error.strerror}") from error
     except playback.Unplayable as error:
@@ -164,11 +164,11 @@ def _device(
     generators = {name: generator for name, (generator, _) in words.items()}
     try:
         return SimulatedDevice(
-            tags, step=every, seed=seed, chosen=generators, played=played, warn=_warn
+            tags, step=every, seed=seed, chosen=generators, played=played.values, warn=_warn
         )
     except Refused as error:
-        if error.tag in played:
-            raise click.UsageError(f"{play}: {error}") from error
+        if error.row is not None:
+            raise click.UsageError(f"{play}:{played.lines[error.row]}: {error}") from error
         where = f"--set {words[error.tag][1]}: " if error.tag in words else ""
         raise click.UsageError(f"{where}{error}") from error
 
