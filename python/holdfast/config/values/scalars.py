@@ -71,6 +71,7 @@ MAX_SPARKPLUG_ID = 255
 NAME_FORM = "1 to 64 letters, digits, '_', '.' and '-'"
 MEASUREMENT_FORM = "text that neither begins with # nor ends in a backslash"
 _NAME = r"[A-Za-z0-9_.-]{1,64}"
+_MEASUREMENT = r"(?!#)[\s\S]*[^\\]"
 _STATUS_NAME = "[ -~]{0,16}"
 _BYTE = r"([01]?[0-9]?[0-9]|2[0-4][0-9]|25[0-5])"
 _HIGH_BYTE = r"(12[89]|1[3-9][0-9]|2[0-4][0-9]|25[0-5])"
@@ -252,7 +253,7 @@ def is_measurement(text: str) -> bool:
     A line that begins with # is a comment, and a backslash at the end would escape what follows.
     Nothing escapes either.
     """
-    return not text.startswith("#") and not text.endswith("\\")
+    return re.fullmatch(_MEASUREMENT, text) is not None
 
 
 def _measurement(text: str) -> str:
@@ -414,7 +415,11 @@ ReceiverUrl = Annotated[
 TopicFilter = Annotated[str, Parsed(parse_topic_filter, minLength=1, maxLength=MAX_TEXT)]
 TopicName = Annotated[str, Parsed(parse_topic_name, minLength=1, maxLength=MAX_TEXT)]
 TopicTemplate = Annotated[str, Parsed(parse_topic_template, "plant/{device}/{tag}")]
-Measurement = Annotated[str, Field(min_length=1), AfterValidator(_measurement)]
+Measurement = Annotated[
+    str,
+    Field(min_length=1, json_schema_extra={"pattern": f"^{_MEASUREMENT}$"}),
+    AfterValidator(_measurement),
+]
 SparkplugId = Annotated[str, Parsed(_sparkplug_id, pattern="^[^+/#]{1,255}$")]
 PeerAddress = Annotated[str, Parsed(parse_peer)]
 Source = Annotated[
