@@ -225,6 +225,29 @@ def test_a_first_line_of_something_else_is_an_error_of_nats(line: bytes) -> None
         asyncio.run(begin())
 
 
+def test_a_flush_waits_until_the_server_has_what_the_client_still_holds(
+    sender: tuple[Caller, SafeClient], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caller, client = sender
+
+    async def work() -> list[bytes]:
+        is_taken = asyncio.Event()
+        monkeypatch.setattr(client.transport, "drain", is_taken.wait)
+        await client.publish("wire.a", b"0")
+        while client._pending:
+            await asyncio.sleep(0)
+        await client.publish("wire.a", b"1")
+        assert client._pending, "the server takes nothing more for now"
+        await client.flush()
+        held = client._pending
+        is_taken.set()
+        return held
+
+    inbox = caller.listen("wire.>")
+    assert caller.do(work()) == []
+    assert [inbox.next() for _ in range(2)] == [0, 1]
+
+
 def test_addresses_of_servers_that_are_none_are_left_out() -> None:
     async def begin() -> bytes:
         client = _Heard()

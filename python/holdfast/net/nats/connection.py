@@ -208,7 +208,7 @@ class Broker:
             listening.cancel()
         self._note_lost("the connection was lost")
 
-    async def _listen(self, client: Client, ended: asyncio.Event) -> None:
+    async def _listen(self, client: SafeClient, ended: asyncio.Event) -> None:
         """Subscribes to all subjects. Sets `ended` on failure."""
         self._subscriptions = []
         try:
@@ -216,9 +216,6 @@ class Broker:
                 queue = self.queue if subject in self.shared else ""
                 made = await client.subscribe(subject, queue=queue, cb=handler)
                 self._subscriptions.append(made)
-            # nats-py may send the ping of a flush before what is still in its buffer. At the end of
-            # the first flush, the buffer is sent; the second one waits until the server has it.
-            await client.flush()
             await client.flush()
             self._subscribed = True
         except (Error, OSError) as error:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
-from nats.aio.client import Client
+from nats.aio.client import DEFAULT_FLUSH_TIMEOUT, Client
 from nats.aio.msg import Msg
 from nats.aio.transport import TcpTransport
 from nats.errors import Error, ProtocolError
@@ -351,14 +351,22 @@ class SafeClient(Client):
         task = self._reconnection_task
         return self.is_reconnecting and task is not None and task.done()
 
+    async def flush(self, timeout: int = DEFAULT_FLUSH_TIMEOUT) -> None:
+        """Waits until the server has all that was sent, and has answered it.
+
+        nats-py sends the ping that asks for this before what is still in its buffer.
+        """
+        if self.is_connected and self._pending_data_size > 0:
+            self.transport.writelines(self._pending)
+            self._pending, self._pending_data_size = [], 0
+        await super().flush(timeout)
+
     async def drain_all(self, subscriptions: Collection[Subscription]) -> None:
         """Ends subscriptions, after the handlers were called for all that the server has sent."""
         for number, each in list(self._subs.items()):
             if each in subscriptions:
                 await self._send_unsubscribe(number)
-        # nats-py sends the ping of a flush before what is still in its buffer, so that `drain`
-        # alone loses messages.
-        await self.flush()
+        # `drain` alone loses messages.
         await self.flush()
         for each in subscriptions:
             await each.drain()  # type: ignore[no-untyped-call]
