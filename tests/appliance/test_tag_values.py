@@ -324,7 +324,7 @@ def test_a_device_that_another_node_polls_has_no_values(tmp_path: Path) -> None:
     assert poll([]) == 0
     assert (set(found.standby), found.answering()) == ({"m"}, {"m": False})
     assert (poll(registers), poll(registers)) == (4, 0)
-    found.refresh("out", {("m", "power"), ("m", "gone")})
+    found.renew("out", {("m", "power"), ("m", "gone")})
     assert (poll(registers), poll(registers)) == (1, 0)
     assert (found.answering(), len(found.latest())) == ({"m": True}, 4)
     assert not found.standby

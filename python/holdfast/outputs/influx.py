@@ -15,7 +15,7 @@ from holdfast.net.addresses import joined
 from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, https_context
 from holdfast.outputs.line_protocol import lines
-from holdfast.outputs.sending import Receiver, Refused, soon_after
+from holdfast.outputs.sending import MAX_READINGS, Receiver, Refused, soon_after
 
 if TYPE_CHECKING:
     from holdfast.config.models.outputs import InfluxConfig
@@ -37,9 +37,10 @@ UNWANTED = (400, TOO_LARGE, 422)
 """Answers to a request that would be refused each time. All others are tried again: a token or a
 bucket can be put right."""
 
-MAX_PARTINGS = 30
-"""How often one call of `send` parts what is refused for its values, in search of the tags. About
-three are found among a thousand at a time."""
+MAX_TOO_LARGE = 10
+"""How many single values of one call of `send` are found too large, before it gives up all others:
+a receiver that takes no request of any size must not get a request for each value.
+"""
 
 
 class Influx(Receiver):
@@ -50,8 +51,9 @@ class Influx(Receiver):
         self._target = settings.target
         self._connection: http.client.HTTPConnection | None = None
         self._has_ended = self._is_late = False
-        self._refused: set[tuple[str, str]] = set()
-        """Devices and tags whose last values were refused, each by itself."""
+        self._most = MAX_READINGS
+        """The readings of a request, at most. Less than the receiver takes after one that was too
+        large."""
         self._secrets: list[str] = []
         """What no message may repeat, of the last request."""
         self._path = self._target.path
@@ -65,36 +67,26 @@ class Influx(Receiver):
         soon_after(stop, self._end)
 
     def send(self, readings: list[Reading]) -> None:
-        """Sends all values, in one request if it is taken; those without a value are left out.
+        """Sends all values but those without a value. If a request is too large, in parts.
 
-        Raises `Refused` for those that the receiver does not take by themselves. One value can have
-        a whole request refused, or all its line, and how much of it no answer tells for sure.
+        Raises `Refused` for those that the receiver does not take.
         """
-        waiting = [readings]
-        if self._refused:
-            waiting = [
-                [reading for reading in readings if _tag(reading) in self._refused],
-                [reading for reading in readings if _tag(reading) not in self._refused],
-            ]
+        rest, reason, too_large = readings, "", 0
         refused: list[Reading] = []
-        reason, partings = "", 0
-        while waiting:
-            part = waiting.pop()
+        while rest:
+            part = rest[: self._most]
             status, message = self._sent(part)
-            if status not in UNWANTED:
-                if self._refused:
-                    self._refused.difference_update(map(_tag, part))
+            if status == TOO_LARGE and len(part) > 1:
+                self._most = len(part) // 2
                 continue
-            reason = message
-            by_size = status == TOO_LARGE
-            halves = _halves(part, by_size=by_size)
-            if all(halves) and (by_size or partings < MAX_PARTINGS):
-                partings += not by_size
-                waiting += halves
-                continue
-            refused += part
-            if not all(halves):
-                self._refused.add(_tag(part[0]))
+            rest = rest[len(part) :]
+            if status in UNWANTED:
+                refused, reason = refused + part, message
+                too_large += status == TOO_LARGE
+                if too_large == MAX_TOO_LARGE:
+                    refused, rest = refused + rest, []
+            else:
+                self._most = min(2 * self._most, MAX_READINGS)
         if refused:
             raise Refused(reason, refused)
 
@@ -218,22 +210,3 @@ class Influx(Receiver):
             self._secrets = [pair, password]
             return {"Authorization": f"Basic {pair}"}
         return {}
-
-
-def _tag(reading: Reading) -> tuple[str, str]:
-    return reading.device, reading.tag.name
-
-
-def _halves(readings: list[Reading], *, by_size: bool) -> tuple[list[Reading], list[Reading]]:
-    """The second and the first half of readings: by their number, or by their tags. One is empty if
-    there is nothing to part.
-    """
-    if by_size:
-        middle = len(readings) // 2
-        return readings[middle:], readings[:middle]
-    tags = list(dict.fromkeys(map(_tag, readings)))
-    first = set(tags[: len(tags) // 2])
-    return (
-        [reading for reading in readings if _tag(reading) not in first],
-        [reading for reading in readings if _tag(reading) in first],
-    )

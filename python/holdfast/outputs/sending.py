@@ -305,10 +305,15 @@ class Sending:
         has_lost = self._buffer.dropped > self._renewed_dropped
         if self._is_failing or not (has_lost or self._refused_tags):
             return
+        # What waits comes first: a renewal must not take its room.
+        if has_lost and len(self._buffer) >= MAX_READINGS:
+            return
         if (now := time.monotonic()) >= self._renewed_at + RENEWAL_INTERVAL_S:
-            self._renewed_dropped, self._renewed_at = self._buffer.dropped, now
+            self._renewed_at = now
             tags, self._refused_tags = self._refused_tags, set()
             self._renew(None if has_lost else tags)
+            # Those of the renewal that did not fit would not fit the next time either.
+            self._renewed_dropped = self._buffer.dropped
 
     def _log_left(self) -> None:
         stored = self._buffer.stored

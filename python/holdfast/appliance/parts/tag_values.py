@@ -214,7 +214,8 @@ class TagValues:
             output.buffer,
             None if file is None else opened,
             leaves,
-            partial(self.refresh, name),
+            # With `scan`, the next poll follows what was lost.
+            partial(self.renew, name) if output.settings.publish == "change" else bool,
         )
 
     def find(self, device: str, tag: str) -> Tag | None:
@@ -248,19 +249,21 @@ class TagValues:
         with self._lock:
             return dict(self._answering)
 
-    def refresh(self, output: str, tags: Collection[tuple[str, str]] | None = None) -> None:
-        """Offers the last value of each tag to an output again. Thread-safe.
-
-        With `tags` of devices, only has their next values published.
-        """
+    def refresh(self, output: str) -> None:
+        """Offers the last value of each tag to an output again. Thread-safe."""
         with self._lock:
-            if (known := self._outputs.get(output)) is None:
-                return
-            if tags is not None:
+            if (known := self._outputs.get(output)) is not None and not self._ending.is_set():
+                known.changes.forget(self._readers)
+                known.offer(poll for poll, _ in self._latest.values())
+
+    def renew(self, output: str, tags: Collection[tuple[str, str]] | None) -> None:
+        """Does the same; with `tags` of devices, has their next values published. Thread-safe."""
+        if tags is None:
+            return self.refresh(output)
+        with self._lock:
+            if (known := self._outputs.get(output)) is not None:
                 known.changes.forget_tags(tags)
-                return
-            known.changes.forget(self._readers)
-            known.offer(poll for poll, _ in self._latest.values())
+        return None
 
     def heartbeat(self) -> ThreadHeartbeat | None:
         """The heartbeat of the thread; `None` before the start."""
