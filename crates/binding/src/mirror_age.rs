@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use holdfast_engine::poller::MirrorAge as Core;
-use holdfast_journal::log::time_since_boot;
+use holdfast_runtime::time_since_boot;
 use pyo3::prelude::*;
 
 use crate::arguments::seconds;

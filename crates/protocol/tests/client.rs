@@ -7,7 +7,8 @@ use std::time::Duration;
 
 use holdfast_protocol::client::{
     AcceptUnit, Attempt, BUSY_PAUSE, Closed, Connection, Done, Echo, Failure, GUARD,
-    InvalidResponse, MAX_STRAY_DATAGRAMS, Strays, TURNAROUND, Ticket, Tolerance, Transport,
+    InvalidResponse, MAX_READ_DELAY, MAX_STRAY_DATAGRAMS, Strays, TURNAROUND, Ticket, Tolerance,
+    Transport,
 };
 use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
 use holdfast_protocol::pdu::{
@@ -254,6 +255,60 @@ fn a_late_reply_is_dropped_and_counted_and_a_second_one_is_an_error() {
     let invalid = InvalidResponse::TransactionId(0);
     assert_eq!(client.got(), [(second, Err(Failure::Invalid(invalid)))]);
     assert_eq!(client.connection.closed(), Some(Closed::Invalid(invalid)));
+}
+
+/// As after a stop of the process.
+#[test]
+fn a_reply_that_is_read_long_after_its_timeout_is_late_however_early_it_came() {
+    let pdu = [3, 2, 0, 42];
+    let frames: [(Transport, Vec<u8>); 7] = [
+        (Transport::Tcp, mbap_frame(0, 7, &pdu)),
+        (Transport::Udp, mbap_frame(0, 7, &pdu)),
+        (Transport::RtuOverTcp, rtu_frame(7, &pdu)),
+        (Transport::RtuOverUdp, rtu_frame(7, &pdu)),
+        (Transport::AsciiOverTcp, ascii_frame(7, &pdu)),
+        (RTU, rtu_frame(7, &pdu)),
+        (ASCII, ascii_frame(7, &pdu)),
+    ];
+    for (transport, reply) in frames {
+        let read_after = |delay| {
+            let mut client = Client::new(transport);
+            client.send(read());
+            client.outgoing();
+            client.now += SECOND + delay;
+            client.receive(&reply);
+            client
+        };
+        let mut client = read_after(MAX_READ_DELAY - Duration::from_nanos(1));
+        assert_eq!(client.got(), [(Ticket(0), Ok(vec![0, 42]))], "{transport:?}");
+        for delay in [MAX_READ_DELAY, 60 * MAX_READ_DELAY] {
+            let mut client = read_after(delay);
+            assert_eq!(client.got(), [(Ticket(0), Err(Failure::Timeout))], "{transport:?}");
+            let is_dropped = client.connection.closed() == Some(Closed::TimedOut);
+            assert!(is_dropped || client.connection.late() == 1, "{transport:?}");
+            assert_eq!(client.connection.take_strays(), Strays::default(), "{transport:?}");
+        }
+    }
+}
+
+#[test]
+fn a_reply_that_was_doubted_until_long_after_its_timeout_is_not_believed() {
+    let reply = rtu_frame(7, &[3, 2, 0, 42]);
+    for (held_up, outcome) in [(GUARD, Ok(vec![0, 42])), (2 * SECOND, Err(Failure::Timeout))] {
+        let mut client = Client::new(RTU);
+        client.send(read());
+        client.outgoing();
+        // Its reply never comes.
+        client.after(SECOND);
+        client.got();
+        client.after(9 * SECOND);
+        let ticket = client.send(read());
+        assert!(!client.outgoing().is_empty());
+        client.receive(&reply);
+        assert_eq!(client.got(), [], "another one may follow");
+        client.after(held_up);
+        assert_eq!(client.got(), [(ticket, outcome)]);
+    }
 }
 
 #[test]

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 
 use holdfast_protocol::client::{Attempt, Closed, Connection, Done, Past, Transport};
 use holdfast_protocol::pdu::{EncodedRequest, Response};
-use holdfast_runtime::lock;
+use holdfast_runtime::{Epoch, lock};
 
 use super::byte_stream::{ByteStream, StreamError};
 use super::connect::connect;
@@ -41,7 +41,7 @@ pub struct BlockingClient {
     longest_late: AtomicU64,
     strays: Arc<StrayCounters>,
     /// The zero of the clock of all its connections.
-    epoch: Instant,
+    epoch: Epoch,
     trace: Option<Trace>,
 }
 
@@ -61,7 +61,7 @@ struct Open {
     connection: Connection,
     transport: Transport,
     /// The zero of the clock of the connection.
-    epoch: Instant,
+    epoch: Epoch,
     used: Instant,
     /// Late replies that were counted.
     late: u64,
@@ -104,7 +104,7 @@ impl BlockingClient {
             late: AtomicU64::new(0),
             longest_late: AtomicU64::new(0),
             strays: Arc::default(),
-            epoch: Instant::now(),
+            epoch: Epoch::now(),
             trace: None,
         }
     }
@@ -364,7 +364,7 @@ impl State {
 impl Open {
     fn new(
         endpoint: &Endpoint,
-        epoch: Instant,
+        epoch: Epoch,
         deadline: Instant,
         timeout: Duration,
     ) -> Result<Open, ClientError> {
@@ -380,7 +380,7 @@ impl Open {
             StreamError::Tls(failure) => ClientError::Tls { to: to(), failure, maybe_sent: false },
         })?;
         let now = Instant::now();
-        let connection = Connection::tolerant(transport, endpoint.tolerance, now - epoch);
+        let connection = Connection::tolerant(transport, endpoint.tolerance, epoch.elapsed());
         // The keys of a hasher are random.
         let connection = connection.unpredictable(RandomState::new().hash_one(0));
         let connection = match &endpoint.place {
@@ -456,10 +456,10 @@ impl Open {
                 self.connection.receive(&chunk[..len], self.epoch.elapsed(), &mut *sink);
             }
         }
-        let now = Instant::now();
-        let timeout = deadline.saturating_duration_since(now);
+        let now = self.epoch.elapsed();
+        let timeout = deadline.saturating_duration_since(Instant::now());
         let Call { unit_id, request, attempt, .. } = *call;
-        let sent = self.connection.send_again(unit_id, request, timeout, attempt, now - self.epoch);
+        let sent = self.connection.send_again(unit_id, request, timeout, attempt, now);
         let ticket = match sent {
             Ok(ticket) => ticket,
             Err(why) => {
@@ -491,11 +491,11 @@ impl Open {
                 }
                 has_begun = true;
                 call.was_sent.store(true, Ordering::Relaxed);
-                let until = self.epoch + self.connection.deadline().unwrap_or(now - self.epoch);
-                match self.stream.send(outgoing, until) {
+                let until = self.connection.deadline().unwrap_or(now);
+                match self.stream.send(outgoing, self.epoch.at(until)) {
                     // Part of the request may have been sent.
                     Err(StreamError::TimedOut) => {
-                        self.connection.advance(until - self.epoch, &mut *sink);
+                        self.connection.advance(until, &mut *sink);
                         self.connection.close(Closed::TimedOut, sink);
                         return Ok(());
                     }
@@ -509,7 +509,7 @@ impl Open {
                 self.connection.close(Closed::BySelf, sink);
                 return Ok(());
             }
-            let until = self.epoch + until;
+            let until = self.epoch.at(until);
             let slice = match has_begun {
                 true => interrupt.slice(until),
                 false => until.min(Instant::now() + SIGNAL_CHECK_INTERVAL),
@@ -537,7 +537,7 @@ mod tests {
     use std::io::Read;
     use std::net::TcpListener;
 
-    use holdfast_protocol::client::Tolerance;
+    use holdfast_protocol::client::{TURNAROUND, Tolerance};
     use holdfast_protocol::frame::rtu;
     use holdfast_protocol::pdu::{Range, Request};
 
@@ -638,16 +638,18 @@ mod tests {
         let request = EncodedRequest::new(&Request::ReadHoldingRegisters(range));
         let transport = Transport::SerialRtu { silence: Duration::ZERO };
         let mut connection = Connection::new(transport);
-        // Its reply may come for 10 s from now on.
+        // Units may confirm it for a minute.
         let timeout = Duration::from_secs(60);
-        connection.send(1, &request, timeout, Duration::ZERO).unwrap();
+        let write = EncodedRequest::new(&Request::WriteSingleRegister { address: 0, value: 1 });
+        let now = client.epoch.elapsed();
+        connection.send(0, &write, timeout, now).unwrap();
         connection.sent(connection.outgoing().len());
-        connection.advance(timeout, |_| {});
+        connection.advance(now + TURNAROUND, |_| {});
         client.state.lock().unwrap().open = Some(Open {
             stream: Box::new(Stalled { waiting: VecDeque::new(), copy: None }),
             connection,
             transport,
-            epoch: Instant::now() - timeout,
+            epoch: client.epoch,
             used: Instant::now(),
             late: 0,
         });
@@ -657,7 +659,7 @@ mod tests {
             if is_sent || asked.get() > 3 { Err(ClientError::Expired) } else { Ok(()) }
         };
         let conditions = Conditions { to_begin: &to_begin, to_go_on: None };
-        let answer = client.call(&conditions, 1, &request, timeout, |_, _| ());
+        let answer = client.call(&conditions, 1, &write, timeout, |_, _| ());
         assert!(matches!(answer, Err(ClientError::Expired)), "{answer:?}");
         assert_eq!(asked.get(), 4);
         assert!(client.state.lock().unwrap().open.is_some());

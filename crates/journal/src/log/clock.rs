@@ -3,6 +3,8 @@
 
 use std::time::Duration;
 
+use holdfast_runtime::time_since_boot;
+
 #[derive(Debug, Clone, Default)]
 pub(super) enum Clock {
     #[default]
@@ -41,28 +43,6 @@ impl Moment {
     }
 }
 
-/// The time since the machine was started. [`std::time::Instant`] stands still during a suspend on Linux
-/// and macOS.
-#[cfg(any(target_os = "linux", target_os = "android", target_vendor = "apple"))]
-pub fn time_since_boot() -> Duration {
-    use rustix::time::{ClockId, clock_gettime};
-    #[cfg(target_vendor = "apple")]
-    let now = clock_gettime(ClockId::Monotonic);
-    #[cfg(not(target_vendor = "apple"))]
-    let now = clock_gettime(ClockId::Boottime);
-    let seconds = u64::try_from(now.tv_sec).unwrap_or_default();
-    Duration::new(seconds, u32::try_from(now.tv_nsec).unwrap_or_default())
-}
-
-/// The time since the process began. On Windows, [`std::time::Instant`] goes on during a suspend.
-#[cfg(not(any(target_os = "linux", target_os = "android", target_vendor = "apple")))]
-pub fn time_since_boot() -> Duration {
-    use std::sync::LazyLock;
-    use std::time::Instant;
-    static BEGAN: LazyLock<Instant> = LazyLock::new(Instant::now);
-    BEGAN.elapsed()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -74,17 +54,5 @@ mod tests {
         while clock.now() == before {}
         assert!(clock.now() > before);
         assert_eq!(before.since(clock.now()), Duration::ZERO);
-    }
-
-    #[test]
-    #[cfg(target_os = "linux")]
-    fn the_clock_counts_the_time_since_the_machine_was_started() {
-        let uptime = || {
-            let text = std::fs::read_to_string("/proc/uptime").unwrap();
-            Duration::from_secs_f64(text.split(' ').next().unwrap().parse().unwrap())
-        };
-        let (before, now, after) = (uptime(), time_since_boot(), uptime());
-        let hundredth = Duration::from_millis(10);
-        assert!(before <= now && now <= after + hundredth, "{before:?} {now:?} {after:?}");
     }
 }

@@ -40,7 +40,6 @@ use std::time::Duration;
 use holdfast_memory::{Journal, Memory};
 use holdfast_runtime::lock;
 
-pub use clock::time_since_boot;
 pub use defaults::{MAX_LAG, WRITE_TIMEOUT};
 pub use error::LogError;
 pub use log_reader::{LogReader, Record, Until};

@@ -11,7 +11,7 @@ use super::mbap_datagrams::Datagrams;
 use super::mbap_stream::Stream;
 use super::raised_timeouts::Lateness;
 use super::rtu_and_ascii::{Framing, OneAtATime};
-use super::{Attempt, Closed, Time, Tolerance, Transport};
+use super::{Attempt, Closed, MAX_READ_DELAY, Time, Tolerance, Transport};
 use crate::pdu::EncodedRequest;
 
 /// One connection, from start to end.
@@ -254,6 +254,12 @@ impl Connection {
         if self.flights.closed.is_some() || (bytes.is_empty() && !datagram) {
             return;
         }
+        if self.awaits_reply_until().is_some_and(|until| until + MAX_READ_DELAY <= now) {
+            self.advance(now, &mut sink);
+            if self.flights.closed.is_some() {
+                return;
+            }
+        }
         let flights = &mut self.flights;
         let waiting = flights.len();
         flights.reply_begun = true;
@@ -263,6 +269,17 @@ impl Connection {
             Wire::OneAtATime(line) => line.receive(flights, bytes, now, &mut sink),
         }
         self.after(waiting, now, sink);
+    }
+
+    /// When the first timeout ends of the requests that were sent.
+    fn awaits_reply_until(&self) -> Option<Time> {
+        if self.flights.held.is_some() {
+            return None;
+        }
+        match &self.wire {
+            Wire::OneAtATime(line) => line.awaits_reply_until(&self.flights),
+            _ => self.flights.deadline(),
+        }
     }
 
     /// When to call [`Connection::advance`], unless another call comes first.

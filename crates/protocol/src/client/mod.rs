@@ -16,6 +16,8 @@
 //!   come or late replies are known to have ended. The next connection gets this as [`Past`].
 //! * Transaction ids go on from one connection to the next, and none is used again while a reply to it may
 //!   come.
+//! * A reply that is read long after its timeout is late too, however early it came ([`MAX_READ_DELAY`]): the
+//!   process may have been stopped.
 //! * What no request asked for is counted apart from late replies ([`Strays`]). Datagrams that match no
 //!   request are dropped, because their sender may be forged; a flood of them ends the connection.
 //! * A connection ends when a reply broke off, and after [`MAX_CONSECUTIVE_TIMEOUTS`] without a byte:
@@ -58,6 +60,10 @@ pub type Time = Duration;
 /// The number of consecutive timeouts, without a received byte, after which a connection ends.
 /// Requests in flight at the same time count as one.
 pub const MAX_CONSECUTIVE_TIMEOUTS: u32 = 3;
+
+/// How long after its timeout a reply may be read that came in time: the driver may have had no processor. One
+/// that is read later is a late reply, because its values are old.
+pub const MAX_READ_DELAY: Duration = Duration::from_secs(1);
 
 /// The transport of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

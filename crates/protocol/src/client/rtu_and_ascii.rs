@@ -11,7 +11,7 @@ use super::attempts::Attempt;
 use super::echo::Echo;
 use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::late_replies_without_ids::{Ended, GUARD, LateReplies, Unanswered, confirmation};
-use super::{Closed, Failure, InvalidResponse, Time};
+use super::{Closed, Failure, InvalidResponse, MAX_READ_DELAY, Time};
 use crate::frame::{FrameError, ascii, rtu};
 use crate::pdu::{self, EncodedRequest, ExceptionCode, Response, ResponseError};
 
@@ -187,6 +187,15 @@ impl OneAtATime {
             State::Turnaround { until } | State::Doubting { until } => Some(until),
             State::Quieting { until } => flights.deadline().map(|deadline| deadline.min(until)),
             State::Idle | State::Sent { .. } => flights.deadline(),
+        }
+    }
+
+    /// When the timeout of the request ends, if it was sent.
+    pub(super) fn awaits_reply_until(&self, flights: &Flights) -> Option<Time> {
+        match self.state {
+            State::Sent { .. } => flights.deadline(),
+            State::Doubting { until } => flights.deadline().max(Some(until)),
+            State::Idle | State::Quieting { .. } | State::Turnaround { .. } => None,
         }
     }
 
@@ -618,15 +627,22 @@ impl OneAtATime {
             if until > now {
                 return;
             }
-            if !self.is_maybe_echo {
+            let waits_until = self.awaits_reply_until(flights);
+            let is_old = waits_until.is_some_and(|until| until + MAX_READ_DELAY <= now);
+            if self.is_maybe_echo {
+                self.was_echo();
+            } else if is_old {
+                self.doubted = None;
+                self.state = State::Sent { echoed: true };
+            } else {
                 return self.believe_doubted(flights, now, sink);
             }
-            self.was_echo();
         }
         // First of all: where a thread wakes up late, its request is sent late, and not given up unsent.
         self.transmit(flights, now);
-        if flights.first().is_some_and(|flight| flight.deadline <= now) {
-            self.note_ended(flights, Ended::TimedOut, now);
+        if let Some(deadline) = flights.deadline().filter(|deadline| *deadline <= now) {
+            // Where this is called late, its reply may have come before, and is read only now.
+            self.note_ended(flights, Ended::TimedOut, deadline);
         }
         if let Some(flight) = flights.expired(now) {
             let sent = !matches!(self.state, State::Quieting { .. });

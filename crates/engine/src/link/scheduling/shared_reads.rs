@@ -7,8 +7,8 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use holdfast_protocol::pdu::EncodedRequest;
+use holdfast_runtime::time_since_boot;
 use tokio::sync::Notify;
-use tokio::time::Instant;
 
 use crate::link::route::Reply;
 
@@ -40,7 +40,8 @@ struct EqualReads {
 
 struct Cached {
     pdu: Vec<u8>,
-    until: Instant,
+    /// By a clock that goes on while the machine is suspended.
+    until: Duration,
     /// The count of changes when the read was sent.
     changes: u64,
 }
@@ -75,7 +76,7 @@ impl SharedReads {
         }
         let cached = self.cached.borrow();
         let found = cached.get(read)?;
-        let holds = found.changes == changes && Instant::now() < found.until;
+        let holds = found.changes == changes && time_since_boot() < found.until;
         holds.then(|| found.pdu.clone())
     }
 
@@ -84,7 +85,7 @@ impl SharedReads {
         if self.keep.is_zero() {
             return;
         }
-        let now = Instant::now();
+        let now = time_since_boot();
         let mut cached = self.cached.borrow_mut();
         if cached.len() >= MAX_CACHED_READS {
             cached.retain(|_, kept| now < kept.until);

@@ -14,7 +14,7 @@ use holdfast_protocol::client::{
     Attempt, Closed, Connection, Done, Failure, Past, Ticket, Tolerance, Transport,
 };
 use holdfast_protocol::pdu::EncodedRequest;
-use holdfast_runtime::Retry;
+use holdfast_runtime::{Epoch, Retry};
 use socket2::SockRef;
 use tokio::net::TcpStream;
 use tokio::net::tcp::OwnedReadHalf;
@@ -63,7 +63,7 @@ pub(in crate::link) struct TcpLink {
     /// What it left to the next one.
     past: Rc<RefCell<Past>>,
     /// The zero of the clock of all connections.
-    epoch: Instant,
+    epoch: Epoch,
     open: Rc<RefCell<Option<Open>>>,
 }
 
@@ -76,7 +76,7 @@ type Waiting = BTreeMap<Ticket, oneshot::Sender<Outcome>>;
 /// An open connection.
 struct Open {
     connection: Connection,
-    epoch: Instant,
+    epoch: Epoch,
     waiting: Waiting,
     /// Requests that wait for a pause.
     held: Vec<(Ticket, Permit)>,
@@ -115,7 +115,7 @@ impl TcpLink {
             pause: ConnectPause::new(retry),
             ended: Rc::default(),
             past: Rc::default(),
-            epoch: Instant::now(),
+            epoch: Epoch::now(),
             open: Rc::default(),
         }
     }
@@ -282,10 +282,9 @@ impl TcpLink {
     ) -> Result<Sent<'_>, Failure> {
         let mut open = self.open.borrow_mut();
         let found = open.as_mut().ok_or(LOST)?;
-        let now = Instant::now();
-        let timeout = deadline.saturating_duration_since(now);
+        let timeout = deadline.saturating_duration_since(Instant::now());
         found.resend_limit.cover(SockRef::from(found.writer.as_ref()), timeout);
-        let sent = now - found.epoch;
+        let sent = found.epoch.elapsed();
         let ticket = found.connection.send_again(unit_id, request, timeout, attempt, sent);
         match ticket {
             Ok(ticket) if found.write() => {
@@ -320,8 +319,8 @@ impl TcpLink {
     /// When something is due on the connection.
     fn due(&self) -> Instant {
         let open = self.open.borrow();
-        let due = open.as_ref().and_then(|open| Some(open.epoch + open.connection.deadline()?));
-        let due = due.unwrap_or_else(Instant::now);
+        let due = open.as_ref().and_then(|open| Some(open.epoch.at(open.connection.deadline()?)));
+        let due = due.map_or_else(Instant::now, Instant::from);
         let held = open.iter().flat_map(|open| &open.held);
         held.filter_map(|(_, permit)| Some(permit.until?.into())).fold(due, Instant::min)
     }
@@ -387,7 +386,6 @@ impl Open {
 
     /// Drops the requests that have waited for a pause for too long, and what nobody waits for.
     fn give_up_held(&mut self) {
-        let now = Instant::now();
         let Open { connection, waiting, held, epoch, .. } = self;
         if !connection.is_held() {
             held.clear();
@@ -396,7 +394,7 @@ impl Open {
             if permit.is_expected(false) {
                 return true;
             }
-            connection.cancel(*ticket, now.saturating_duration_since(*epoch));
+            connection.cancel(*ticket, epoch.elapsed());
             if let Some(sender) = waiting.remove(ticket) {
                 // A device that was stopped does not wait.
                 let _ = sender.send(None);
