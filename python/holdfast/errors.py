@@ -6,7 +6,7 @@
     ├── ConnectionLost       the connection ended before the reply
     │   ├── ConnectFailed    could not connect: nothing was sent
     │   └── TlsFailed        TLS failed: reason
-    ├── RequestTimeout       no reply or no connection within the timeout
+    ├── RequestTimeout       no reply within the timeout, or nothing could be sent
     └── InvalidResponse      an invalid reply: reason
 
 Messages are for people. Programs should use classes and attributes.
@@ -134,7 +134,7 @@ class TlsFailed(ConnectionLost):
 
 
 class RequestTimeout(ModbusError, TimeoutError):
-    """No reply arrived within the timeout, or no connection was made in that time.
+    """No reply arrived within the timeout, or nothing could be sent in that time.
 
     `maybe_sent` says whether the device may have executed the request, or has executed earlier ones
     of the call.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import os
 import signal
 import socket
 import struct
@@ -986,6 +987,19 @@ def test_a_broadcast_waits_for_no_reply(kind: str, make: Make, dial: Dial) -> No
 
     assert client.read_holding_registers(3, 1, unit=1) == [3]
     assert [asked.unit for asked in device.requests] == [0, 1]
+
+
+def test_on_a_line_that_is_not_silent_nothing_is_sent_and_the_error_says_so(
+    make: Make, dial: Dial
+) -> None:
+    device = make("rtu", silence=10)
+    assert isinstance(device, Serial)
+    client = dial(device.url, timeout=SHORT)
+    os.write(device.terminal.end, b"\xff")
+    with pytest.raises(holdfast.RequestTimeout, match=r"nothing was sent within 0\.1 s") as raised:
+        client.write_register(0, 1)
+    assert not raised.value.maybe_sent
+    assert not device.requests
 
 
 @pytest.mark.parametrize("kind", LINES)

@@ -747,6 +747,15 @@ def test_a_silent_device_is_exception_0b_once_it_is_connected(
         wire.until(lambda: front.ask(READ) == exception(READ, 0x0B), "it is connected")
 
 
+def test_a_line_that_is_not_silent_is_exception_0a(
+    tmp_path: Path, run: Run, connect: Connect
+) -> None:
+    with Serial(RTU, tmp_path / "line", silence=10) as device:
+        front = connect(scada(run(configuration(device.url, link={"timeout": 0.1}))))
+        assert front.ask(WRITE) == exception(WRITE, 0x0A)
+    assert not device.requests
+
+
 def test_a_device_that_is_back_is_asked_again(run: Run, connect: Connect) -> None:
     with Stream("tcp", port=closed_port()) as device:
         device.stop()

@@ -588,9 +588,9 @@ pub(crate) fn raised(error: &ClientError) -> PyErr {
             ModbusException::new_err((*code, name))
         }
         ClientError::Timeout(_) => RequestTimeout::new_err(text),
-        ClientError::ConnectTimeout { .. } | ClientError::LookupTimeout { .. } => {
-            RequestTimeout::new_err((text, false))
-        }
+        ClientError::NoSilence(_)
+        | ClientError::ConnectTimeout { .. }
+        | ClientError::LookupTimeout { .. } => RequestTimeout::new_err((text, false)),
         ClientError::Connect { to, error } => {
             ConnectFailed::new_err((to.clone(), os_text(error), error.raw_os_error()))
         }

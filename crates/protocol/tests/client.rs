@@ -691,16 +691,20 @@ fn a_serial_line_is_silent_before_a_request_and_what_came_before_is_thrown_away(
 }
 
 #[test]
-fn a_serial_line_that_is_never_silent_lets_the_request_time_out_unsent() {
+fn on_a_serial_line_that_is_never_silent_a_request_ends_unsent_and_says_so() {
     let mut client = Client::new(RTU);
     client.receive(&[0]);
-    let ticket = client.send(read());
-    while client.got.is_empty() {
+    let request = EncodedRequest::new(&WRITE);
+    client.connection.send(7, &request, SECOND, client.now).unwrap();
+    let mut ended = Vec::new();
+    while ended.is_empty() {
         client.receive(&[0]);
-        client.after(SILENCE / 2);
+        client.now += SILENCE / 2;
+        let sink = |done: Done<'_>| ended.push((done.outcome.map(drop), done.maybe_sent));
+        client.connection.advance(client.now, sink);
         assert_eq!(client.outgoing(), []);
     }
-    assert_eq!(client.got(), [(ticket, Err(Failure::Timeout))]);
+    assert_eq!(ended, [(Err(Failure::NoSilence), false)]);
     assert_eq!(client.connection.closed(), None);
 }
 

@@ -448,7 +448,7 @@ impl Open {
     ) -> Result<(), StreamError> {
         let mut chunk = [0; CHUNK_BYTES];
         if matches!(self.transport, Transport::SerialRtu { .. } | Transport::SerialAscii { .. }) {
-            // On a line that is never silent, the request times out.
+            // On a line that is never silent, the request is not sent.
             while Instant::now() < deadline
                 && !interrupt.is_hit()
                 && let Some(len) = self.stream.receive_now(&mut chunk)?

@@ -35,6 +35,9 @@ pub enum ClientError {
     /// No valid reply arrived within the timeout.
     #[error("no reply within {} s", .0.as_secs_f64())]
     Timeout(Duration),
+    /// The line was not silent within the timeout. Nothing was sent.
+    #[error("nothing was sent within {} s: the line was not silent", .0.as_secs_f64())]
+    NoSilence(Duration),
     /// The connection was not made within the timeout. Nothing was sent.
     #[error("no connection to {to} within {} s", .after.as_secs_f64())]
     ConnectTimeout { to: String, after: Duration },
@@ -76,6 +79,7 @@ impl ClientError {
         match failure {
             Failure::Exception(code) => ClientError::Exception(code),
             Failure::Timeout => ClientError::Timeout(timeout),
+            Failure::NoSilence => ClientError::NoSilence(timeout),
             Failure::Invalid(invalid) => ClientError::Invalid(invalid),
             Failure::Closed(why) => ClientError::Lost(Lost::Closed(why)),
             _ => unreachable!("unknown failure: {failure}"),

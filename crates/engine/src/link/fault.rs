@@ -72,12 +72,17 @@ impl Fault {
 }
 
 /// The code of the exception that a client of a gateway gets for an error (V1.1b3, 7): that of the device,
-/// or that its address could not be reached. After that one, clients send a write again: nothing was sent.
+/// or that it could not be asked. After that one, clients send a write again: nothing was sent.
 /// Any other error counts as a device that did not answer.
 pub(crate) fn exception_code(error: &ClientError) -> u8 {
     match (error, fault(error)) {
         (_, Fault::Exception(code)) => code,
-        (ClientError::ConnectTimeout { .. } | ClientError::LookupTimeout { .. }, _)
+        (
+            ClientError::NoSilence(_)
+            | ClientError::ConnectTimeout { .. }
+            | ClientError::LookupTimeout { .. },
+            _,
+        )
         | (_, Fault::Refused | Fault::Unreachable | Fault::Standby) => {
             ExceptionCode::GatewayPathUnavailable.code()
         }
@@ -119,6 +124,7 @@ pub(crate) fn fault(error: &ClientError) -> Fault {
     match error {
         ClientError::Exception(code) => Fault::Exception(*code),
         ClientError::Timeout(_)
+        | ClientError::NoSilence(_)
         | ClientError::ConnectTimeout { .. }
         | ClientError::LookupTimeout { .. } => Fault::Timeout,
         ClientError::Connect { error, .. } if is_unreachable(error.kind()) => Fault::Unreachable,
@@ -182,6 +188,7 @@ mod tests {
             (ClientError::Connect { to: to.clone(), error: refused }, 0x0A),
             (ClientError::ConnectTimeout { to, after: Duration::ZERO }, 0x0A),
             (ClientError::Fenced, 0x0A),
+            (ClientError::NoSilence(Duration::ZERO), 0x0A),
             (ClientError::Timeout(Duration::ZERO), 0x0B),
             (ClientError::Lost(Lost::Closed(Closed::BySelf)), 0x0B),
             (FLOODED, 0x0B),

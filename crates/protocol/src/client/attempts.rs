@@ -38,7 +38,9 @@ impl Attempt {
             Failure::Exception(_) | Failure::Closed(Closed::BySelf | Closed::NoTransactionId) => {
                 return None;
             }
-            Failure::Timeout | Failure::Invalid(_) | Failure::Closed(_) => tolerance.pause,
+            Failure::Timeout | Failure::NoSilence | Failure::Invalid(_) | Failure::Closed(_) => {
+                tolerance.pause
+            }
         };
         (self.retries < tolerance.retries).then(|| Attempt {
             retries: self.retries + 1,

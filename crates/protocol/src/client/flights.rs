@@ -286,7 +286,8 @@ impl Flights {
             let failed = outcome.as_ref().err();
             let again =
                 failed.and_then(|error| attempt.next(&request, *error, stale, &self.tolerance));
-            let maybe_sent = self.held.is_none() || attempt != Attempt::default();
+            let was_sent = self.held.is_none() && failed != Some(&Failure::NoSilence);
+            let maybe_sent = was_sent || attempt != Attempt::default();
             sink(Done { ticket, timeout, outcome, pdu, maybe_sent, again });
         }
     }

@@ -101,6 +101,9 @@ pub enum Failure {
     /// No reply arrived within the timeout.
     #[error("no reply in time")]
     Timeout,
+    /// The request was not sent: within the timeout, the line was not silent.
+    #[error("the line was not silent")]
+    NoSilence,
     /// The reply cannot belong to the request.
     #[error("invalid response: {0}")]
     Invalid(InvalidResponse),

@@ -648,7 +648,12 @@ impl OneAtATime {
             let sent = !matches!(self.state, State::Quieting { .. });
             self.rest(now);
             let invalid = self.stray.map(InvalidResponse::Frame);
-            flights.end(flight, Err(invalid.map_or(Failure::Timeout, Failure::Invalid)), sink);
+            let failure = match invalid {
+                Some(invalid) => Failure::Invalid(invalid),
+                None if sent => Failure::Timeout,
+                None => Failure::NoSilence,
+            };
+            flights.end(flight, Err(failure), sink);
             if sent && self.silence.is_none() {
                 flights.close(Closed::TimedOut, sink);
             }

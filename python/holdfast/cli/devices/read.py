@@ -141,7 +141,7 @@ def read(
             try:
                 device_errors.fail(error, url, shown, of_modicon, is_in_area=place is not None)
             finally:  # Its hint follows the others.
-                if place and isinstance(error, RequestTimeout):
+                if place and isinstance(error, RequestTimeout) and error.maybe_sent:
                     device.await_late_reply(client, place.area, place.address)
     if as_json:
         print_json({"ok": not query.undecodable(raw), **fields, **query.found(raw)})

@@ -65,7 +65,11 @@ def read_tags(source: TagSource, form: Form, every: float | None, times: int | N
 
 def _listen(source: TagSource, readings: Sequence[Reading]) -> None:
     """Waits for a late reply to the last request that timed out."""
-    late = [each.tag for each in readings if isinstance(each.error, RequestTimeout)]
+    late = [
+        each.tag
+        for each in readings
+        if isinstance(each.error, RequestTimeout) and each.error.maybe_sent
+    ]
     if late:
         source.listen(late[-1])
 
