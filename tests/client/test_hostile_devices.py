@@ -989,6 +989,29 @@ def test_a_broadcast_waits_for_no_reply(kind: str, make: Make, dial: Dial) -> No
     assert [asked.unit for asked in device.requests] == [0, 1]
 
 
+@pytest.mark.parametrize("kind", LINES)
+def test_a_name_that_is_another_adapter_s_now_is_opened_again_after_a_timeout(
+    kind: str, make: Make, dial: Dial, tmp_path: Path
+) -> None:
+    before, now = make(kind, then=silent), make(kind)
+    assert isinstance(before, Serial)
+    assert isinstance(now, Serial)
+    name = tmp_path / "name"
+    name.symlink_to(before.terminal.device)
+    client = dial(before.url.replace(str(before.terminal.device), str(name)), timeout=SHORT)
+    with pytest.raises(holdfast.RequestTimeout):
+        client.read_holding_registers(7, 1)
+    name.unlink()
+    name.symlink_to(now.terminal.device)
+
+    def is_answered() -> bool:
+        with suppress(holdfast.RequestTimeout):
+            return client.read_holding_registers(7, 1) == [7]
+        return False
+
+    wire.until(is_answered, "the other adapter is opened")
+
+
 def test_on_a_line_that_is_not_silent_nothing_is_sent_and_the_error_says_so(
     make: Make, dial: Dial
 ) -> None:

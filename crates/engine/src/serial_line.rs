@@ -14,7 +14,7 @@ use std::sync::{Arc, Mutex, Weak};
 use std::time::Duration;
 
 #[cfg(unix)]
-use rustix::fs::{FlockOperation, Mode, OFlags, flock, fstat, open, stat};
+use rustix::fs::{FlockOperation, Mode, OFlags, Stat, flock, fstat, open, stat};
 #[cfg(unix)]
 use rustix::io::Errno;
 use serial2_tokio::rs4xx::Rs485Config;
@@ -68,7 +68,15 @@ pub struct SerialLine {
 #[derive(Debug)]
 pub(crate) struct OpenLine<Port> {
     pub(crate) port: Port,
-    _lock: Lock,
+    device: String,
+    lock: Lock,
+}
+
+impl<Port> OpenLine<Port> {
+    /// Whether its name is that of another device now. A name that is gone says nothing.
+    pub(crate) fn has_moved(&self) -> bool {
+        is_another(&self.device, &self.lock)
+    }
 }
 
 impl SerialLine {
@@ -77,7 +85,7 @@ impl SerialLine {
         let lock = lock(&self.device, User::Listener)?;
         let port = SerialPort::open(&self.device, |settings: Settings| self.set(settings))?;
         self.set_direction(|mode| set_mode_of_tokio(&port, mode))?;
-        Ok(OpenLine { port, _lock: lock })
+        Ok(OpenLine { port, device: self.device.clone(), lock })
     }
 
     /// Opens the device for blocking calls.
@@ -86,7 +94,7 @@ impl SerialLine {
         let set = |settings: Settings| self.set(settings);
         let port = serial2::SerialPort::open(&self.device, set)?;
         self.set_direction(|mode| set_mode(&port, mode))?;
-        Ok(OpenLine { port, _lock: lock })
+        Ok(OpenLine { port, device: self.device.clone(), lock })
     }
 
     /// Lets the driver switch the direction of the line.
@@ -179,12 +187,9 @@ fn lock(device: &str, user: User) -> io::Result<Lock> {
     let mut held = holdfast_runtime::lock(&HELD);
     held.retain(|_, lock| lock.strong_count() > 0);
     let found = stat(&path)?;
-    // A device that is plugged in again is another one.
     let is_same = |lock: &Lock| {
-        fstat(&lock.file).is_ok_and(|of| {
-            lock.of_process == std::process::id()
-                && (of.st_dev, of.st_ino, of.st_rdev) == (found.st_dev, found.st_ino, found.st_rdev)
-        })
+        lock.of_process == std::process::id()
+            && fstat(&lock.file).is_ok_and(|of| is_device(&of, &found))
     };
     if let Some(lock) = held.get(&path).and_then(Weak::upgrade).filter(is_same) {
         if (lock.user, user) != (User::Listener, User::Listener) {
@@ -206,9 +211,26 @@ fn lock(device: &str, user: User) -> io::Result<Lock> {
     Ok(lock)
 }
 
+/// A device that is plugged in again is another one.
+#[cfg(unix)]
+fn is_device(one: &Stat, other: &Stat) -> bool {
+    (one.st_dev, one.st_ino, one.st_rdev) == (other.st_dev, other.st_ino, other.st_rdev)
+}
+
+#[cfg(unix)]
+fn is_another(device: &str, lock: &Lock) -> bool {
+    let (named, open) = (stat(device), fstat(&lock.file));
+    named.is_ok_and(|named| open.is_ok_and(|open| !is_device(&open, &named)))
+}
+
 /// Windows lets nobody open a line twice.
 #[cfg(not(unix))]
 type Lock = ();
+
+#[cfg(not(unix))]
+fn is_another(_device: &str, _lock: &Lock) -> bool {
+    false
+}
 
 #[cfg(not(unix))]
 fn lock(_device: &str, _user: User) -> io::Result<Lock> {

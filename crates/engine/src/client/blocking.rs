@@ -204,7 +204,9 @@ impl BlockingClient {
             let longest = open.connection.longest_late().as_nanos();
             self.longest_late.fetch_max(longest.try_into().unwrap_or(u64::MAX), Ordering::Relaxed);
             open.count_strays(&self.strays);
-            if open.connection.closed().is_some() {
+            // An adapter that has another name now may be open and silent for ever.
+            let is_silent = matches!(result, Some(Err(ClientError::Timeout(_))));
+            if open.connection.closed().is_some() || is_silent && open.stream.has_moved() {
                 state.end();
             }
             if let Some(error) = call.refused.take() {

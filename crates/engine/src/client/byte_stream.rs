@@ -42,6 +42,11 @@ pub(super) trait ByteStream: Send {
         false
     }
 
+    /// Whether the stream is that of another device than its name is now.
+    fn has_moved(&self) -> bool {
+        false
+    }
+
     /// Whether the stream is open and no bytes wait in it.
     fn is_quiet(&self) -> bool {
         true
@@ -250,6 +255,10 @@ impl ByteStream for OpenLine<serial2::SerialPort> {
     fn send(&mut self, bytes: &[u8], deadline: Instant) -> Result<(), StreamError> {
         self.port.set_write_timeout(millis(deadline)?)?;
         Ok(Write::write_all(&mut self.port, bytes)?)
+    }
+
+    fn has_moved(&self) -> bool {
+        OpenLine::has_moved(self)
     }
 }
 

@@ -49,6 +49,10 @@ impl ByteStream for Traced {
         self.stream.has_ended()
     }
 
+    fn has_moved(&self) -> bool {
+        self.stream.has_moved()
+    }
+
     fn is_quiet(&self) -> bool {
         self.stream.is_quiet()
     }
