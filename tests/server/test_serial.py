@@ -609,6 +609,21 @@ def test_a_broadcast_to_read_only_units_changes_nothing(start: Start) -> None:
     assert plant.memory.read("holding_registers", 0, 1) == [0]
 
 
+def test_a_broadcast_into_what_is_passed_on_to_a_device_is_refused_and_logged(
+    start: Start, caplog: pytest.LogCaptureFixture
+) -> None:
+    into = {"memory": "plant", "area": "holding_registers", "address": 0}
+    read = {"area": "holding_registers", "address": 0, "count": 1, "into": into}
+    with Stream("tcp") as device:
+        meter = {"url": device.url, "interval": 3600, "writes": "pass", "reads": [read]}
+        plant = start(devices={"meter": meter})
+        plant.line.send(plant.line.mode.frame(WRITE, 0))
+        wire.until(lambda: logged(plant, caplog, "refused_address"), "the refusal is logged")
+
+        assert plant.line.ask(WRITE) == WRITE, "a write to its unit is passed on"
+    assert [asked.pdu for asked in device.requests if asked.pdu[0] == 6] == [WRITE]
+
+
 # Diagnostics
 
 

@@ -22,6 +22,7 @@ use crate::link::{Asker, PendingReply, exception_in};
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::comm_events::{CommEvents, Received};
 use crate::server::reports::counters::{Bus, Counters, FrameCounters};
+use crate::server::reports::refused_request::RefusedRequest;
 use crate::server::requests::exceptions::{NOT_ALLOWED, exception_of, out_of_ranges};
 use crate::server::requests::identity::Identity;
 use crate::server::requests::listen_only::ListenOnly;
@@ -253,19 +254,20 @@ impl UnitServer {
     /// reply, even if several memories carry it out. `permit` is asked before each that the peer may write, and
     /// `note` receives each memory, the reply that it would have sent, where a log has the write, and the permit if
     /// the write may have been carried out. A journal is waited for, because what follows on the line
-    /// expects the effects.
+    /// expects the effects. A device is not: a write into a range whose writes are passed on is refused, or a device
+    /// that does not answer would hold up the line. Returns a refusal by a memory that the peer may write.
     pub async fn broadcast<P>(
         &self,
         rights: &PeerRights,
         request: &[u8],
         mut permit: impl FnMut() -> Option<P>,
         mut note: impl FnMut(Option<&Memory>, &[u8], Option<u64>, Option<P>),
-    ) {
+    ) -> Option<RefusedRequest> {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
         self.counters.unanswered.add();
         self.comm_events.receive(Received::Broadcast);
-        let (mut carried_out, mut refused) = (false, None);
+        let (mut carried_out, mut refused, mut reported) = (false, None, None);
         let may =
             |unit_id| rights.allows(unit_id, function_code) && !outside(rights, unit_id, request);
         for unit_id in
@@ -292,6 +294,10 @@ impl UnitServer {
                 Some(code) => refused = refused.or(ExceptionCode::from_code(code)),
                 None => carried_out = true,
             }
+            if may(unit_id) {
+                reported =
+                    reported.or(RefusedRequest::from_reply(rights, unit_id, request, &reply));
+            }
             note(rights.memory(unit_id), &reply, log_sequence, permit);
         }
         match refused {
@@ -300,6 +306,7 @@ impl UnitServer {
             None => {}
         }
         self.comm_events.send(None, false);
+        reported
     }
 
     #[inline]

@@ -362,7 +362,8 @@ impl ModbusSerial {
                 auditor.note_forwarded(&context.name, None, BROADCAST, forwarded, permit);
             }
         };
-        self.unit_server.broadcast(&self.rights.get(), request, permit, note).await;
+        let refused = self.unit_server.broadcast(&self.rights.get(), request, permit, note).await;
+        context.note_refused(refused, &self.reported, None);
     }
 }
 
