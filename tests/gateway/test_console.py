@@ -541,6 +541,7 @@ def test_the_keyboard_is_enough(opened: Opened, plant: holdfast.Memory) -> None:
     keyboard.press("Enter")
     expect(view.button("Write it")).to_be_focused()
     assert plant.read("holding_registers", 0, 1) != [4711]
+    expect(view.button("Write it")).to_be_enabled()
     keyboard.press("Enter")
     view.says("Written and read back")
     assert plant.read("holding_registers", 0, 1) == [4711]
@@ -822,11 +823,15 @@ def test_registers_that_can_not_be_read_are_written(opened: Opened) -> None:
         assert device.values[1] == 4711
 
 
-REFRESHED_AFTER = """(ms) => {
+PAUSES = """([usual, ms]) => {
   const wait = window.setTimeout;
-  window.setTimeout = (work, time, ...more) => wait(work, time === 3000 ? ms : time, ...more);
+  window.setTimeout = (work, time, ...more) => wait(work, time === usual ? ms : time, ...more);
 }"""
-"""Changes the time after which a review reads again."""
+"""Changes a time of the page."""
+REFRESHED_AFTER = 3000
+"""The time after which a review reads again."""
+SEEN_AFTER = 700
+"""The time after which what is new in a review can be confirmed."""
 NEVER = 10**9
 LATER = "() => { const now = Date.now; Date.now = () => now() + 60_000; }"
 
@@ -835,7 +840,7 @@ def test_a_review_is_refreshed_before_a_write_if_a_register_has_changed(opened: 
     device = Registers()
     with FakeDevice(device) as changing:
         view = opened()
-        view.page.evaluate(REFRESHED_AFTER, NEVER)
+        view.page.evaluate(PAUSES, [REFRESHED_AFTER, NEVER])
         read_registers(view, changing.port)
         dialog = review(view, "Write 1", "4711")
         expect(dialog.get_by_role("row", name="1 1234 0x04D2 4711 0x1267")).to_be_visible()
@@ -850,11 +855,52 @@ def test_a_review_is_refreshed_before_a_write_if_a_register_has_changed(opened: 
         assert device.values[1] == 4711
 
 
+@pytest.mark.parametrize("new", ["the review", "what has changed", "what has changed while open"])
+def test_a_second_click_or_key_confirms_nothing_unseen(opened: Opened, new: str) -> None:
+    device = Registers()
+    with FakeDevice(device) as plc:
+        view = opened()
+        refreshed = 20 if new == "what has changed while open" else NEVER
+        view.page.evaluate(PAUSES, [REFRESHED_AFTER, refreshed])
+        read_registers(view, plc.port)
+        if new != "the review":
+            review(view, "Write 1", "4711")
+            expect(view.button("Write it")).to_be_enabled()
+        view.page.evaluate(PAUSES, [SEEN_AFTER, NEVER])
+        if new == "the review":
+            review(view, "Write 1", "4711")
+        else:
+            device.values[1] = 7
+            if new == "what has changed":
+                view.button("Write it").click()
+            view.says("The current values have changed.")
+        expect(view.button("Write it")).to_be_focused()
+        expect(view.button("Write it")).to_be_disabled()
+        view.page.keyboard.press("Enter")
+        view.button("Write it").click(force=True)
+        view.button("Back").click()
+        view.button("Cancel").click()
+        assert device.writes == []
+
+
+def test_the_second_click_of_a_slow_double_click_confirms_nothing(opened: Opened) -> None:
+    device = Registers()
+    with FakeDevice(device) as plc:
+        view = opened()
+        read_registers(view, plc.port)
+        review(view, "Write 1", "4711")
+        expect(view.button("Write it")).to_be_enabled()
+        view.button("Write it").dispatch_event("click", {"detail": 2})
+        view.button("Back").click()
+        view.button("Cancel").click()
+        assert device.writes == []
+
+
 def test_an_open_review_is_refreshed(opened: Opened) -> None:
     device = Registers()
     with FakeDevice(device) as changing:
         view = opened()
-        view.page.evaluate(REFRESHED_AFTER, 20)
+        view.page.evaluate(PAUSES, [REFRESHED_AFTER, 20])
         read_registers(view, changing.port)
         dialog = review(view, "Write 1", "4711")
         device.values[1] = 7
@@ -870,7 +916,7 @@ def test_an_old_review_is_refreshed_before_a_write(opened: Opened) -> None:
     device = Registers()
     with FakeDevice(device) as hiding:
         view = opened()
-        view.page.evaluate(REFRESHED_AFTER, NEVER)
+        view.page.evaluate(PAUSES, [REFRESHED_AFTER, NEVER])
         read_registers(view, hiding.port)
         dialog = review(view, "Write 1", "4711")
         device.hides = True
@@ -894,7 +940,8 @@ def test_a_review_ends_if_the_tag_has_another_definition(opened: Opened, noticed
     device = Registers()
     with FakeDevice(device) as tank:
         view = opened(profiles=profiles)
-        view.page.evaluate(REFRESHED_AFTER, 20 if noticed == "while it is open" else NEVER)
+        refreshed = 20 if noticed == "while it is open" else NEVER
+        view.page.evaluate(PAUSES, [REFRESHED_AFTER, refreshed])
         view.connect(port=tank.port)
         view.says("The device responded")
         view.button("Add tag list…").click()

@@ -25,6 +25,11 @@ const MAX_LISTED = 16;
 const REFRESH_MS = 3000;
 /** How long the review may show what was read last when later reads fail, in milliseconds. */
 const MAX_AGE_MS = 5000;
+/**
+ * How long values that are new in a review can't be confirmed, in milliseconds. Systems take two clicks within 500 ms
+ * for a double click by default: its second click has seen nothing.
+ */
+const UNSEEN_MS = 700;
 const READING = "Reading the current value…";
 const CHANGED = "The current values have changed. Check the review again before you write.";
 
@@ -49,6 +54,10 @@ export class Writer {
       event.preventDefault();
       this.step(this.asked);
     });
+    $("write-go").addEventListener("click", (event) => {
+      // Some people need more time for a double click, and have set it.
+      if (event.detail > 1) event.preventDefault();
+    });
     form.addEventListener("keydown", (event) => {
       // A held Enter key must not confirm the next step.
       if (event.key === "Enter" && event.repeat) event.preventDefault();
@@ -61,7 +70,7 @@ export class Writer {
    */
   ask(target) {
     const { part, tag, area, address, ofBits } = target;
-    const asked = { ...target, change: null, before: null, looks: 0, isBusy: false, sending: null, outcome: null, closing: new AbortController() };
+    const asked = { ...target, change: null, before: null, looks: 0, waits: 0, sending: null, outcome: null, closing: new AbortController() };
     this.asked = asked;
     const { host, port, unitId } = part.device;
     const what = ofBits ? "coil" : "holding register";
@@ -75,7 +84,7 @@ export class Writer {
     $("write-value").value = "";
     $("write-error").replaceChildren();
     this.tell("");
-    this.lock(false);
+    this.wait(asked, 0);
     this.back();
     this.help();
     this.dialog.showModal();
@@ -136,9 +145,10 @@ export class Writer {
     $("write-error").scrollIntoView({ block: "nearest" });
   }
 
-  /** Shows whether the dialog is busy with a step. The button keeps the focus, unlike with `disabled`. */
-  lock(is) {
-    $("write-go").setAttribute("aria-disabled", is);
+  /** Lets the button wait for one thing more or less. It keeps the focus, unlike with `disabled`. */
+  wait(asked, change) {
+    asked.waits += change;
+    if (this.asked === asked) $("write-go").setAttribute("aria-disabled", asked.waits > 0);
   }
 
   /** Returns to the first step because of an error: what was reviewed can't be written. */
@@ -149,9 +159,8 @@ export class Writer {
 
   /** Runs one step of a write at a time. The next dialog does not wait for a step of this one. */
   async step(asked) {
-    if (asked.isBusy) return;
-    asked.isBusy = true;
-    this.lock(true);
+    if (asked.waits > 0) return;
+    this.wait(asked, 1);
     $("write-error").replaceChildren();
     let told = "";
     try {
@@ -160,11 +169,9 @@ export class Writer {
     } catch (error) {
       if (this.isAbout(asked)) this.reject(error);
     }
-    asked.isBusy = false;
     asked.sending = null;
-    if (this.asked !== asked) return;
-    this.tell(told);
-    this.lock(false);
+    this.wait(asked, -1);
+    if (this.asked === asked) this.tell(told);
   }
 
   /** Checks what was typed, reads the current values, and shows them beside the new ones. */
@@ -176,14 +183,22 @@ export class Writer {
     const before = await read(change, asked);
     if (!this.isAbout(asked)) return;
     asked.change = change;
-    asked.before = before;
-    reviews.show(change, before);
+    this.present(asked, before);
     $("write-review").hidden = false;
     $("write-ask").hidden = true;
     $("write-go").textContent = "Write it";
     $("write-cancel").textContent = "Back";
     $("write-go").focus();
     this.follow(asked, change);
+  }
+
+  /** Shows what was read beside the new values. It can be confirmed when it can have been seen. */
+  async present(asked, found) {
+    asked.before = found;
+    reviews.show(asked.change, found);
+    this.wait(asked, 1);
+    await pause(UNSEEN_MS);
+    this.wait(asked, -1);
   }
 
   /** Returns whether this change is under review, and nothing is sent yet. */
@@ -211,10 +226,13 @@ export class Writer {
     const shown = asked.before;
     // A read that a write has overtaken may have seen the new values. One read may fail.
     if (!this.isReviewed(asked, change) || (now.error && isRecent(shown.time))) return false;
-    asked.before = now;
     const differs = !equal(now, shown);
-    if (differs) reviews.show(change, now);
-    else reviews.showHeading(change, now);
+    if (differs) {
+      this.present(asked, now);
+    } else {
+      asked.before = now;
+      reviews.showHeading(change, now);
+    }
     return differs;
   }
 
