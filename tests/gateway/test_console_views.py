@@ -588,13 +588,47 @@ def test_the_whole_view_is_in_the_link(opened: Opened) -> None:
 def test_a_damaged_link_is_told(opened: Opened) -> None:
     view = opened()
     view.page.goto(
-        f"{view.gateway.url}/?again#part=yaml,x,AAAA&part=3,65530,10,uint16,ABCD&part=9,9"
+        f"{view.gateway.url}/?again#part=yaml,x,AAAA&part=3,65530,10,uint16,ABCD&part=3,0,4,wide"
     )
     view.connect()
     view.says("The device responded")
+    view.says("A part of the link can't be used: the tag list “x” is damaged")
+    view.says("A part of the link can't be used: “3,65530,10,uint16,ABCD” is not a range.")
+    view.says("A part of the link can't be used: “3,0,4,wide” is not a range.")
+    expect(view.page).to_have_url(re.compile("part=yaml"))
     expect(view.page.locator("#parts li")).to_have_count(0)
     view.button("Read").click()
     view.says("Holding registers 0 to 9: read in")
+
+
+@pytest.mark.parametrize(
+    ("damaged", "says"),
+    [
+        ("part=yaml,tank,K0lML7bi", "the tag list “tank” is damaged"),
+        ("part=4,1000,2,uint16,ABCD&part=9,0,2,uint16&plot=1.0", "“9,0,2,uint16” is not a range"),
+        ("area=7", "area is “7”"),
+        ("type=int", "type is “int”"),
+        ("quantity=-5", "quantity is “-5”"),
+        ("address=4OO", "address is “4OO”"),
+    ],
+)
+def test_what_is_left_of_a_damaged_link_is_not_watched(
+    opened: Opened, damaged: str, says: str
+) -> None:
+    view = opened()
+    link = f"{view.gateway.url}/?again#host=127.0.0.1&port={view.port}&watch=1&{damaged}"
+    view.page.goto(link)
+    view.says(f"A part of the link can't be used: {says}")
+    view.says("The device responded")
+    view.button("Connect").click()
+    view.says("The device responded")
+    view.says(f"A part of the link can't be used: {says}")
+    expect(view.button("Watch")).to_have_attribute("aria-pressed", "false")
+    assert not [url for url in view.requests if url.endswith("/watch/view")]
+    view.choose(area="4", address="1000", quantity="2", type="uint16")
+    view.button("Watch").click()
+    view.says("Watching ")
+    expect(view.page).not_to_have_url(re.compile("plot="))
 
 
 def test_the_link_to_the_values_leaves_that_of_the_page(opened: Opened) -> None:

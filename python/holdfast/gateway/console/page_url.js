@@ -2,7 +2,7 @@
 
 import { typeOf } from "./numbers.js";
 import { list, range } from "./parts.js";
-import { areaOf, LAST_ADDRESS } from "./standard.js";
+import { areaOf, LAST_ADDRESS, TYPES } from "./standard.js";
 
 /** The fields of the page that are parameters with the same names. */
 const DEVICE = ["host", "port", "unit", "transport", "timeout", "server"];
@@ -71,13 +71,17 @@ export async function readPart(text) {
   const [first, ...rest] = text.split(",");
   if (first === "profile") return list(rest.join(), { profile: rest.join() });
   if (first === "yaml" || first === "csv") {
-    const tags = await unpacked(rest.pop());
-    return list(rest.join() || "Tags", { tags, format: first });
+    const part = rest.pop();
+    const title = rest.join() || "Tags";
+    const tags = await unpacked(part).catch(() => {
+      throw new Error(`the tag list “${title}” is damaged, or longer than ${MAX_LENGTH} characters`);
+    });
+    return list(title, { tags, format: first });
   }
   const [area, address, quantity] = [first, rest[0], rest[1]].map(Number);
   const [kind, size] = (rest[2] ?? "").split(":");
-  const type = typeOf(kind, Number(size));
-  const whole = [area, address, quantity].every(Number.isInteger) && type.width > 0;
+  const type = ["bit", "string", "bytes"].includes(kind) || kind in TYPES ? typeOf(kind, Number(size)) : null;
+  const whole = [area, address, quantity].every(Number.isInteger) && type?.width > 0;
   if (!whole || !areaOf(area) || address < 0 || quantity < 1 || address + quantity > LAST_ADDRESS + 1 || quantity > areaOf(area).most) {
     throw new Error(`“${text}” is not a range`);
   }
@@ -107,6 +111,6 @@ async function unpacked(part) {
     const { value, done } = await reader.read();
     if (done) return text;
     text += value;
-    if (text.length > MAX_LENGTH) throw new Error("the tag list of the link is too long");
+    if (text.length > MAX_LENGTH) throw new Error("too long");
   }
 }

@@ -37,6 +37,7 @@ export class Values {
     this.lists = new Lists((part) => this.pin(part));
     this.pinned = [];
     this.panels = [];
+    this.flaws = [];
     this.device = this.plots = this.watching = this.reading = this.heard = null;
     $("range").addEventListener("submit", (event) => {
       event.preventDefault();
@@ -76,16 +77,22 @@ export class Values {
       if (!$(id).options || [...$(id).options].some((each) => each.value === value)) $(id).value = value;
     }
     this.adapt();
+    const found = [];
     for (const text of view.parts) {
       try {
         this.pinned.push(await pageUrl.readPart(text));
       } catch (error) {
-        say($("outcome"), `A part of the link can't be used: ${error.message}.`);
+        found.push(error.message);
       }
     }
+    if (view.parts.length === 0) {
+      for (const [id, value] of view.range) if ($(id).value !== value || !$(id).checkValidity()) found.push(`${id} is “${value}”`);
+    }
+    this.flaws = found.map((each) => `A part of the link can't be used: ${each}. Nothing is watched by itself.`);
     this.chips();
     this.resumes = view.watched;
-    this.plotted = view.plotted;
+    // Plots have the numbers of their parts.
+    this.plotted = found.length > 0 ? [] : view.plotted;
     this.span = view.span;
     return this.resumes;
   }
@@ -95,6 +102,7 @@ export class Values {
     const pinned = this.pinned;
     const spelled = await Promise.all(pinned.map(pageUrl.spelled));
     if (this.pinned !== pinned) return;
+    this.flaws = [];
     pageUrl.putValues((id) => ($(id).disabled ? null : $(id).value), {
       parts: spelled,
       watched: this.watching !== null,
@@ -111,8 +119,9 @@ export class Values {
     this.panels = [];
     $("table").replaceChildren(h("p", { class: "card empty" }, "Choose a range, then read or watch it."));
     $("save").hidden = true;
-    say($("outcome"));
-    if (this.resumes) this.watch(this.wanted());
+    say($("outcome"), ...this.flaws);
+    // What is left of a damaged link is not what was asked for.
+    if (this.resumes && this.flaws.length === 0) this.watch(this.wanted());
     this.resumes = false;
   }
 
