@@ -481,6 +481,48 @@ def test_a_plot_has_a_gap_while_there_is_no_value(opened: Opened) -> None:
         assert [row["time"] for row in rows] == sorted(row["time"] for row in rows)
 
 
+def test_a_plot_keeps_its_order_when_the_clock_is_set_back(opened: Opened) -> None:
+    meter = Meter()
+    with FakeDevice(meter) as device:
+        view = watched(opened, device.port)
+        status = view.page.get_by_role("article").get_by_role("status")
+        expect(status).to_have_text(re.compile(r"\d"))
+        view.page.evaluate("() => { const now = Date.now; Date.now = () => now() - 3_600_000; }")
+        meter.value = 1000
+        expect(status).to_have_text(re.compile(r"\d{4}"))
+        with view.page.expect_download() as found:
+            view.button("Download plots as CSV").click()
+        rows = saved(found.value)
+        values = [int(row["value"]) for row in rows]
+        assert values[0] < 1000 < values[-1]
+        assert values == sorted(values)
+
+
+STRANGE_CLOCKS = """() => {
+  const [now, began] = [performance.now.bind(performance), Date.now()];
+  performance.now = () => 1000 * now();
+  Date.now = () => began - 3_600_000;
+}"""
+"""One goes fast, so that no test has to wait; the other one was set back, and stands still."""
+
+
+def test_values_are_old_without_news_also_when_the_clock_is_set_back(opened: Opened) -> None:
+    def answer(pdu: bytes) -> bytes | None:
+        return None if is_silent else registers(pdu)
+
+    is_silent = False
+    with FakeDevice(answer) as device:
+        view = opened()
+        view.page.get_by_role("spinbutton", name="Timeout").fill("60000")
+        view.connect(port=device.port)
+        view.says("The device responded")
+        view.button("Watch").click()
+        view.says("Watching holding registers 0 to 9")
+        is_silent = True
+        view.page.evaluate(STRANGE_CLOCKS)
+        view.says("No news from the gateway.")
+
+
 def test_a_plot_of_an_invalid_value_has_a_gap(opened: Opened, plant: holdfast.Memory) -> None:
     plant.write("holding_registers", 0, [0x1234])
     view = connected(opened)

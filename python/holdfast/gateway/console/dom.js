@@ -42,6 +42,15 @@ export async function once(button, work) {
 
 export const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
+/**
+ * Returns what tells the milliseconds since now, by the clock that tells more: the clock of the machine may be set back,
+ * and the other one may stand still while the machine sleeps.
+ */
+export function stopwatch() {
+  const [time, steady] = [Date.now(), performance.now()];
+  return () => Math.max(Date.now() - time, performance.now() - steady);
+}
+
 /** Returns a time in milliseconds as hours, minutes and seconds. */
 export const clock = (time) => new Date(time).toTimeString().slice(0, 8);
 

@@ -31,6 +31,13 @@ export class History {
     this.push(this.until + MOMENT, null);
   }
 
+  /** Moves what is known by some seconds. */
+  move(seconds) {
+    if (this.times.length === 0) return;
+    this.times = this.times.map((time) => time + seconds);
+    this.until += seconds;
+  }
+
   push(time, value) {
     this.times.push(time);
     this.values.push(value);

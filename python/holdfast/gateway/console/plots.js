@@ -11,8 +11,6 @@ const AUTOMATIC = 4;
 const HEIGHT = 96;
 const TICK = 250;
 
-const now = () => Date.now() / 1000;
-
 /** The plots of one watch. */
 export class Plots {
   /** `panels` are the parts of the view; `onChoice()` is called when the plots change. */
@@ -23,6 +21,7 @@ export class Plots {
     this.place = $("plots");
     this.shown = new Map();
     this.chosen = false;
+    this.latest = 0;
     this.told = h("p", { class: "dim", role: "status" });
     this.place.replaceChildren(h("div", { class: "bar" }, ...this.chooser(),
       h("label", {}, "Time span", this.spans()),
@@ -94,9 +93,17 @@ export class Plots {
     if (!this.chosen && !this.shown.has(key) && this.shown.size < AUTOMATIC) this.add(key);
   }
 
+  /** Returns the time in seconds. If the clock was set back, what is plotted moves with it, and keeps its order. */
+  now() {
+    const time = Date.now() / 1000;
+    if (time < this.latest) this.shown.forEach((plot) => plot.history.move(time - this.latest));
+    this.latest = time;
+    return time;
+  }
+
   /** Takes the values of a poll. A part that was not answered has a gap. */
   poll() {
-    const time = now();
+    const time = this.now();
     for (const plot of this.shown.values()) plot.take(time);
   }
 
@@ -118,7 +125,7 @@ export class Plots {
     const plot = new Plot(this, panel, cell, panel.label(cell, this.panels.length === 1), () => this.choose(key));
     this.shown.set(key, plot);
     this.place.append(plot.root);
-    plot.take(now());
+    plot.take(this.now());
     plot.show();
   }
 
@@ -129,7 +136,7 @@ export class Plots {
 
   /** Saves the points that are drawn. A gap is a row without a value. */
   download() {
-    const start = now() - this.span;
+    const start = this.now() - this.span;
     const rows = [...this.shown.values()].flatMap((plot) => {
       const [times, values] = plot.history.points();
       return times.flatMap((time, at) => (time < start ? [] : [[new Date(1000 * time).toISOString(), plot.label, values[at] ?? ""]]));
@@ -191,7 +198,8 @@ class Plot {
 
   /** Shows the extremes and the gaps of the time span. */
   describe() {
-    const start = now() - this.plots.span;
+    const now = this.plots.latest;
+    const start = now - this.plots.span;
     const [times, values] = this.history.points();
     let [least, greatest] = [Infinity, -Infinity];
     values.forEach((value, at) => {
@@ -202,7 +210,7 @@ class Plot {
     const extent = least > greatest ? "" : `${shortened(least)} … ${shortened(greatest)}`;
     const gaps = this.history.gaps().filter(([, end]) => end === null || end >= start);
     const open = this.root.classList.contains("old");
-    this.extent.textContent = open ? `no value since ${timeOf(this.history.until || now())}` : extent;
+    this.extent.textContent = open ? `no value since ${timeOf(this.history.until || now)}` : extent;
     const told = gaps.length === 0 ? "" : `, ${gaps.length} ${gaps.length === 1 ? "gap" : "gaps"}`;
     this.body.setAttribute("aria-label", `Plot of ${this.label}${told}`);
   }
@@ -240,7 +248,7 @@ class Plot {
   }
 
   draw() {
-    const end = now();
+    const end = this.plots.now();
     const [allTimes, allValues] = this.history.points();
     const start = end - this.plots.span;
     let first = allTimes.findIndex((time) => time >= start);

@@ -2,7 +2,7 @@
 
 import { notice, Problem } from "./api.js";
 import { save, stamp } from "./csv.js";
-import { $, h, pause, say, show } from "./dom.js";
+import { $, h, pause, say, show, stopwatch } from "./dom.js";
 import { Lists } from "./lists.js";
 import { flaw, modicon, typeOf } from "./numbers.js";
 import * as pageUrl from "./page_url.js";
@@ -404,9 +404,8 @@ export class Values {
 
   /** Takes the values of an event. */
   take(data, mark) {
-    const late = this.heard !== null && Date.now() - this.heard > this.lateAfter();
-    if (late) this.plots?.gap();
-    this.heard = Date.now();
+    if (this.isLate()) this.plots?.gap();
+    this.heard = stopwatch();
     this.took = data.rtt;
     const isView = "stream" in data;
     const changes = isView ? data.parts.map((each, part) => ({ ...each, part })) : data.parts;
@@ -467,9 +466,14 @@ export class Values {
     return 3 * (this.interval + this.took) + (this.device?.timeout ?? 0) * Math.max(1, this.panels.length) + SLACK;
   }
 
+  /** Returns whether the last event is so long ago. */
+  isLate() {
+    return this.heard !== null && this.heard() > this.lateAfter();
+  }
+
   /** Marks the values as old if the gateway is silent. */
   check() {
-    if (!this.watching || !this.began || this.heard === null || Date.now() - this.heard <= this.lateAfter()) return;
+    if (!this.watching || !this.began || !this.isLate()) return;
     this.panels.forEach((panel) => panel.stale("No news from the gateway."));
     this.plots?.gap();
   }
