@@ -523,7 +523,8 @@ def test_too_many_requests_are_told_to_come_again(server: holdfast.Server) -> No
         assert answer.status == 200
 
 
-def test_a_dead_device_leaves_places_for_others(server: holdfast.Server) -> None:
+@pytest.mark.parametrize("path", ["/read", "/watch/view"])
+def test_a_dead_device_leaves_places_for_others(server: holdfast.Server, path: str) -> None:
     asked = threading.Semaphore(0)
 
     def mute(_: bytes) -> None:
@@ -537,17 +538,20 @@ def test_a_dead_device_leaves_places_for_others(server: holdfast.Server) -> None
         ThreadPoolExecutor(2) as threads,
     ):
         body = read(device, timeout=LONG_MS)
-        waiting = [threads.submit(running.ask, "/read", body) for _ in range(2)]
+        if path == "/watch/view":
+            part = {"functionCode": body.pop("functionCode"), "address": body.pop("address")}
+            body |= {"parts": [part], "once": True}
+        waiting = [threads.submit(running.ask, path, body) for _ in range(2)]
         for _ in waiting:
             assert asked.acquire(timeout=wire.DEADLINE)
-        answer = running.ask("/read", body)
+        answer = running.ask(path, body)
         assert answer.headers["holdfast-reason"] == "busy"
         assert f"too many requests to 127.0.0.1:{device.port}: 2 are active" in answer.json["error"]
         live = {"host": "127.0.0.1", "port": server.address[1]}
         assert running.ask("/connect", live).status == 200
         device.stop()
         assert [each.result(wire.DEADLINE).status for each in waiting] == [500, 500]
-        assert running.ask("/read", body).status == 500
+        assert running.ask(path, body).status == 500
 
 
 def test_a_request_that_had_no_turn_says_that_it_was_not_sent() -> None:

@@ -205,6 +205,10 @@ class App(Application):
     def _request(self) -> AbstractContextManager[None]:
         return self._place("requests", self._limits.requests, "requests")
 
+    def _request_to(self, device: RequestedDevice) -> AbstractContextManager[None]:
+        where, most = (device.host.lower(), device.port), self._limits.requests_of_device
+        return self._place(where, most, f"requests to {device.host}:{device.port}")
+
     async def _until_disconnect(
         self, request: Request, work: Coroutine[Any, Any, Result], *, grace: float
     ) -> Result:
@@ -245,9 +249,7 @@ class App(Application):
             if is_write and not self._settings.writes:
                 raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
             device = RequestedDevice(self._egress, self._pool, given, broadcast=endpoint.broadcast)
-            where = device.host.lower(), device.port
-            most, what = self._limits.requests_of_device, f"requests to {device.host}:{device.port}"
-            with self._place(where, most, what):
+            with self._request_to(device):
                 work = self._reply(request, endpoint, given, device, is_write)
                 try:
                     return await self._until_disconnect(request, work, grace=self._limits.ending)
@@ -347,8 +349,12 @@ class App(Application):
             parts = await views.parts_of(given, self._settings.profiles)
         device = RequestedDevice(self._egress, self._pool, given)
         streaming = not given["once"] and self._has_stream(request, given["maxStreams"])
-        once = self._request()
-        with self._stream(request) if streaming else once:
+        with contextlib.ExitStack() as places:
+            if streaming:
+                places.enter_context(self._stream(request))
+            else:
+                places.enter_context(self._request())
+                places.enter_context(self._request_to(device))
             view = views.View(parts, device)
             await self._while_streaming(
                 request, lambda stream: views.follow(given, view, stream, streaming=streaming)
