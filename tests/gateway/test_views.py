@@ -390,6 +390,7 @@ def test_the_registers_of_typed_values_are_told_before_a_write(
     [
         ("uint16", [70000], "values[0]:"),
         ("float32", [1, 1e39], "values[1]:"),
+        ("float32", [0, 1e-50], "values[1]: 1e-50 is too small for float32, which would hold 0"),
         ("float64", [1] * 31, "124 registers, allowed: 123 in a request"),
         ("bit:3", [True], "use /api/modbus/write/mask"),
         ("uint17", [1], "uint17"),

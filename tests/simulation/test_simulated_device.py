@@ -265,6 +265,8 @@ def test_values_at_the_ends_of_the_registers_fit() -> None:
     device = simulated([tag], t="ramp:-3276.74:3276.64:2")
     assert device.memory.read("holding_registers", 0, 1) == [0x10000 - 32767]
     assert simulated([tag], t="constant:3276.6").memory.read("holding_registers", 0, 1) == [32766]
+    half = Tag("t", "holding_registers", 0, "float16")  # A sine has such values beside its zeros.
+    assert simulated([half], t="constant:1e-9").memory.read("holding_registers", 0, 1) == [0]
 
 
 def test_a_counter_begins_again_at_the_end_of_its_registers_and_says_so() -> None:

@@ -114,6 +114,7 @@ def test_a_value_that_does_not_fit_is_refused(
         ((0.2, 0.8), {"type": "int16[2]"}, [0, 1]),
         (array("d", [0.2, 0.8]), {"type": "int16[2]"}, [0, 1]),
         (21.5, {"type": "float32"}, 21.5),
+        (-1e-50, {"type": "float32"}, 0),
     ],
 )
 def test_a_value_between_two_steps_becomes_the_nearest_if_the_tag_or_the_writer_says_so(
@@ -125,6 +126,12 @@ def test_a_value_between_two_steps_becomes_the_nearest_if_the_tag_or_the_writer_
     assert tag(**settings, round="nearest").raw(value) == number
     with pytest.raises(DoesNotFit, match="between two values"):
         tag(**settings, round="exact").raw(value, default_round="nearest")
+
+
+def test_a_float_that_would_be_0_is_refused_unless_it_is_a_measurement() -> None:
+    assert encode(tag(type="float32").raw(1e-50, default_round="nearest"), "float32") == [0, 0]
+    with pytest.raises(DoesNotFit, match="too small for float32"):
+        encode(tag(type="float32").raw(1e-50), "float32")
 
 
 def test_limits_hold_for_the_rounded_value() -> None:

@@ -661,6 +661,25 @@ def test_a_float_too_large_is_refused_and_no_infinity(name: str, most: float) ->
             encode([0.0, value], f"{name}[2]")
 
 
+LEAST_VALUE = {"float16": 2.0**-24, "float32": 2.0**-149, "float64": 5e-324}
+
+
+@pytest.mark.parametrize(("name", "least"), LEAST_VALUE.items())
+def test_a_number_that_would_be_0_is_refused(name: str, least: float) -> None:
+    small: list[Any] = [least / 2, 1e-300, Fraction(least) / 3]
+    if name == "float64":
+        small = [Fraction(1, 10**400)]
+    for value in (0.0, -0.0, least, -least):
+        assert decode(encode(value, name), name) == value
+        assert decode(encode([value, math.nan], f"{name}[2]"), f"{name}[2]")[0] == value
+    for value in (*small, *(-value for value in small)):
+        text = f" is too small for {name}, which would hold 0"
+        with pytest.raises(values.DoesNotFit, match=f"{text}$"):
+            encode(value, name)
+        with pytest.raises(values.DoesNotFit, match=rf"^values\[1\]: .*{text}$"):
+            encode([0.0, value, math.nan], f"{name}[3]")
+
+
 @pytest.mark.parametrize("order", FOUR)
 @pytest.mark.parametrize("name", MAX_VALUE)
 def test_floats_hold_infinities_and_nan(name: str, order: str) -> None:

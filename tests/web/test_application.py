@@ -192,6 +192,7 @@ def test_a_query_that_is_sent_again_is_answered_anew(app: App, memory: holdfast.
         (b'{"a":NaN}', "NaN is out of range"),
         (b"[-Infinity]", "-Infinity is out of range"),
         (b"[1e999]", "1e999 is out of range"),
+        (b"[-0.1e-999]", "-0.1e-999 is out of range"),
         (b"[" + b"9" * 5000 + b"]", "4300 digits"),
         (b'["\\ud800"]', "surrogate"),
         (b'["\xff"]', "can't decode byte 0xff"),

@@ -11,7 +11,7 @@ from holdfast.tags.text import text_of
 from holdfast.values import DoesNotFit, codec_for
 from holdfast.values.digits import shortest
 from holdfast.values.errors import shown
-from holdfast.values.numeric import limits
+from holdfast.values.numeric import limits, nearest_float
 
 if TYPE_CHECKING:
     from holdfast.tags import Tag
@@ -36,7 +36,7 @@ def nearest(tag: Tag, value: Any) -> Any:
     least, most = _limits(tag)
     number = _linear(tag).number(value)
     if tag.is_float:
-        return min(most, max(least, float(number)))
+        return nearest_float(min(most, max(least, float(number))), base)
     raw = int(min(most, max(least, round(number))))
     near = itertools.chain(range(raw, int(least) - 1, -1), range(raw, int(most) + 1))
     return next(each for each in near if each not in tag.null)

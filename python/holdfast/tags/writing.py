@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import struct
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.tags.scale import RegisterScale, ScaledTag, is_finite
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
-from holdfast.values.digits import FLOATS
 from holdfast.values.errors import shown
+from holdfast.values.numeric import nearest_float
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -64,8 +63,8 @@ class WritableTag(ScaledTag):
 
         Raises `DoesNotFit` for a value that they can't hold, and for one below `min` or above
         `max`. `default_round` is for a tag without `round`. A number that stands for a state is
-        never rounded. Floating-point registers take the nearest number; that of a `float16`, which
-        can be far off, is checked again.
+        never rounded. Floating-point registers take the nearest number, 0 only as a measurement;
+        that of a `float16`, which can be far off, is checked again.
         """
         if hasattr(value, "tolist"):
             value = value.tolist()
@@ -85,9 +84,11 @@ class WritableTag(ScaledTag):
         self._check_limits(value, f"{value} is")
         if self.is_float:
             number = self._float(value)
+            held = self._held(number)
             if self.of_type.base == "float16":
-                self._check_half(value, number)
-            return number
+                rounded = self._linear.value(held)
+                self._check_limits(rounded, f"{value} is {rounded} in {self.of_type.element},")
+            return held if (self.round or default_round) == "nearest" else number
         exact = self._linear.number(value)
         if exact.denominator == 1:
             return exact.numerator
@@ -111,15 +112,12 @@ class WritableTag(ScaledTag):
         except OverflowError:
             raise DoesNotFit(f"{value} does not fit {self.type}") from None
 
-    def _check_half(self, value: float, number: float) -> None:
-        """Checks the limits of what a `float16` makes of a number."""
-        form = FLOATS["float16"]
+    def _held(self, number: float) -> float:
+        """What the registers make of a number."""
         try:
-            [held] = struct.unpack(form, struct.pack(form, number))
+            return nearest_float(number, self.of_type.base)
         except OverflowError:
-            return  # The codec refuses it, and says what the type allows.
-        rounded = self._linear.value(held)
-        self._check_limits(rounded, f"{value} is {rounded} in {self.of_type.element},")
+            return number  # The codec refuses it, and says what the type allows.
 
     def _check_limits(self, value: float, found: str) -> None:
         least, most = self.min, self.max

@@ -6,6 +6,7 @@ import struct
 from abc import abstractmethod
 from math import isinf
 from numbers import Real
+from operator import not_
 from typing import TYPE_CHECKING, Any
 
 from holdfast.values.digits import FLOATS
@@ -38,6 +39,13 @@ def limits(base: str) -> tuple[float, float]:
         return 0, 10 ** (2 * size) - 1
     least = -(1 << 8 * size - 1) if base.startswith("i") else 0
     return least, least + (1 << 8 * size) - 1
+
+
+def nearest_float(number: float, base: str) -> float:
+    """The nearest number of a floating-point type. Raises `OverflowError` beyond the type."""
+    form = f">{FLOATS[base]}"
+    found: float = struct.unpack(form, struct.pack(form, number))[0]
+    return found
 
 
 class Number(Kind):
@@ -111,12 +119,30 @@ class Integer(Number):
 
 
 class Float(Number):
-    """`float16` to `float64`. Integers and more precise floats are rounded to the nearest value."""
+    """`float16` to `float64`. Integers and more precise floats are rounded to the nearest value.
+
+    A number that would be 0 does not fit: 0 is often another thing than something small, as in a
+    divisor or a switch.
+    """
 
     plain = frozenset({float, int})
 
     def __init__(self, type: Type, order: Order) -> None:
         super().__init__(type, order, FLOATS[type.base])
+
+    def pack_one(self, value: Any) -> bytes:
+        """The bytes of a number. Raises `DoesNotFit`."""
+        data = super().pack_one(value)
+        if value != 0 and self.unpack_one(data) == 0:
+            raise DoesNotFit(f"{shown(value)} is too small for {self.name}, which would hold 0")
+        return data
+
+    def pack_many(self, values: Sequence[Any]) -> bytes:
+        """The bytes of a whole array. Raises `DoesNotFit`."""
+        data = super().pack_many(values)
+        if sum(map(not_, values)) != sum(map(not_, self.unpack_many(data))):
+            return Kind.pack_many(self, values)  # It names the value that would be 0.
+        return data
 
     def _number(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, Real):

@@ -130,7 +130,8 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _float(text: str) -> float:
     value = float(text)
-    if not math.isfinite(value):
+    would_be_zero = value == 0 and re.search("[1-9]", re.split("[eE]", text)[0])
+    if not math.isfinite(value) or would_be_zero:
         raise ValueError(f"{text[:40]} is out of range")
     return value
 
