@@ -588,6 +588,7 @@ def test_more_tabs_than_connections_watch_and_write(opened: Opened, plant: holdf
     for page in pages:
         cell = page.locator("tr[data-address='4'] td").first
         expect(cell).to_have_text("4711")
+        expect(page.get_by_role("button", name="Remove the plot of 4")).to_be_visible()
     for page in pages[1:-1]:
         page.close()
     expect(last.get_by_text("Other tabs use the streams")).to_be_hidden()

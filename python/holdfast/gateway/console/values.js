@@ -415,8 +415,9 @@ export class Values {
       const panel = this.panels[each.part];
       if ("error" in each || isView) errors[each.part] = each.error ? new Problem(each.reason, each.error, each.code) : null;
       if (isView && !each.values) continue;
-      const cells = isView ? panel.set(each, mark && panel.values.length > 0) : panel.change(each, mark);
-      changed.push(...cells.map((cell) => [panel, cell]));
+      const isFirst = panel.values.length === 0;
+      const cells = isView ? panel.set(each, mark && !isFirst) : panel.change(each, mark);
+      if (!isFirst) changed.push(...cells.map((cell) => [panel, cell]));
     }
     this.panels.forEach((panel, at) => {
       panel.error = errors[at];
@@ -424,7 +425,7 @@ export class Values {
       else panel.fresh(data.time, this.watching === null);
     });
     if (this.watching && this.plots) {
-      if (!isView) for (const [panel, cell] of changed) this.plots.changed(panel, cell);
+      for (const [panel, cell] of changed) this.plots.changed(panel, cell);
       this.plots.poll();
     }
     if (this.watching) this.report(errors);
