@@ -276,6 +276,16 @@ def test_a_tag_is_written_in_its_unit(opened: Opened, plant: holdfast.Memory) ->
     expect(tag(view, "room")).to_have_text("21.5")
 
 
+def test_a_tag_with_its_scale_in_a_register_offers_no_writing(opened: Opened) -> None:
+    view = connected(opened)
+    add_tags(view, "name,area,address,type,scale,writable\npower,hr,0,int16,factor hr 1 uint16,yes")
+    view.button("Read").click()
+    only = view.page.locator("tr[data-tag='power']").get_by_text("read only")
+    expect(only).to_have_attribute("title", "its scale is in a register")
+    expect(view.button("Plot power")).to_be_visible()
+    expect(view.button("Write power")).to_have_count(0)
+
+
 def test_a_review_of_a_tag_lists_its_registers(opened: Opened, plant: holdfast.Memory) -> None:
     plant.write("holding_registers", 10, [0, 0x41AC, 0x0800])
     view = connected(opened)

@@ -30,7 +30,7 @@ export class TagTable extends Panel {
     const button = (text, onclick) =>
       h("button", { class: "quiet", type: "button", "aria-label": `${text} ${tag.name}`, onclick }, text);
     const { write, plot } = this.actions;
-    const writes = write && tag.writable;
+    const flaw = !tag.writable ? "writable is not true in the tag list" : typeof tag.scale !== "number" ? "its scale is in a register" : null;
     return h("tr", { role: "row", "data-tag": tag.name },
       h("th", { role: "rowheader", scope: "row", title: tag.description }, tag.name),
       value,
@@ -38,8 +38,8 @@ export class TagTable extends Panel {
       h("td", { role: "cell", class: "place" }, placed(tag)),
       h("td", { role: "cell", class: "do" },
         isPlotted(tag) ? button("Plot", () => plot(tag.name)) : null,
-        writes ? button("Write", () => write(tag.name)) : null,
-        write && !tag.writable ? h("span", { class: "dim", title: "writable is not true in the tag list" }, "read only") : null));
+        write && flaw === null ? button("Write", () => write(tag.name)) : null,
+        write && flaw !== null ? h("span", { class: "dim", title: flaw }, "read only") : null));
   }
 
   render(index, mark) {
