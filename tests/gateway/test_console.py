@@ -445,6 +445,45 @@ def test_a_gateway_that_only_reads_offers_no_writing(opened: Opened) -> None:
     expect(view.button("Write 0")).to_have_count(0)
 
 
+@pytest.mark.parametrize("noticed", ["by a write", "by a watch", "by a connect"])
+def test_the_right_to_write_is_that_after_a_reload(opened: Opened, noticed: str) -> None:
+    def status(route: Route) -> None:
+        route.fulfill(json={**route.fetch().json(), "writes": False})
+
+    def refuse(route: Route) -> None:
+        said = {"success": False, "error": "writes are disabled"}
+        route.fulfill(status=403, headers={"Holdfast-Reason": "writes_off"}, json=said)
+
+    view = opened()
+    view.connect()
+    view.says("The device responded")
+    view.button("Read").click()
+    expect(view.button("Write 0")).to_be_visible()
+    view.page.route("**/api/gateway", status)
+    view.page.route("**/write/register", refuse)
+    if noticed == "by a write":
+        view.button("Write 0").click()
+        view.page.get_by_role("textbox", name="New value").fill("7")
+        view.button("Review").click()
+        view.button("Write it").click()
+        view.says("Not written.")
+        view.button("Cancel").click()
+    elif noticed == "by a watch":
+        part = {"kind": "range", "values": [0] * 10, "texts": ["0"] * 10, "errors": {}}
+        body = json.dumps({"time": 0, "rtt": 0, "stream": True, "parts": [part]})
+        ended = {"content_type": "text/event-stream", "body": f"event: view\ndata: {body}\n\n"}
+        view.page.route("**/watch/view", lambda route: route.fulfill(**ended), times=1)
+        view.button("Watch").click()
+        view.says("Watching holding registers 0 to 9")
+    else:
+        view.button("Connect").click()
+        view.says("The device responded")
+        view.button("Read").click()
+    view.says("reads only")
+    expect(view.button("Plot 0")).to_be_visible()
+    expect(view.button("Write 0")).to_have_count(0)
+
+
 def test_a_token_is_asked_for_and_kept_in_the_tab_only(opened: Opened) -> None:
     view = opened(tokens=(("edge", hashlib.sha256(SECRET.encode()).digest()),))
     box = view.page.get_by_label("Token", exact=True)

@@ -6,7 +6,7 @@ import * as pageUrl from "./page_url.js";
 import { Discovery } from "./discovery.js";
 import { Values } from "./values.js";
 
-const may = { write: null };
+const may = { write: null, ask: inquire };
 /** Errors of the probe after which other areas may still respond. */
 const UNPROVEN = new Set(["timeout", "connection_lost", "invalid_reply", "exception"]);
 const PROBE = "It can't read holding register 0, but other areas may work";
@@ -83,7 +83,7 @@ async function connect() {
   connecting = aborting;
   say($("connection"), "Connecting…");
   try {
-    if (may.write === null) await inquire();
+    await inquire();
     const began = performance.now();
     const found = await post("/api/modbus/connect", asked, aborting.signal);
     if (connecting !== aborting) return;

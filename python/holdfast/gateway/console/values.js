@@ -29,7 +29,7 @@ const MAX_PARTS_SIZE = 63 * 1024;
 /** How long the first poll of a tag list may take, in milliseconds. */
 const LONG = 60_000;
 
-/** The values view. `may.write` is whether the gateway allows writes; `null` until it has said so. */
+/** The values view. `may.write` is whether the gateway allows writes; `null` until `may.ask()` has found out. */
 export class Values {
   constructor(may) {
     this.may = may;
@@ -264,7 +264,8 @@ export class Values {
   show(wanted, data) {
     this.plots?.end();
     this.plots = null;
-    this.panels = wanted.map((each, at) => this.panel(each, data.parts[at].tags));
+    this.offers = this.may.write;
+    this.panels = wanted.map((each, at) => this.panel(each, data.parts[at].tags ?? this.panels[at]?.tags));
     $("table").replaceChildren(...this.panels.map((panel) => panel.place));
     if (wanted.length > 1) this.panels.forEach((panel) => (panel.heading.hidden = false));
     this.wholes = wanted;
@@ -289,6 +290,8 @@ export class Values {
     if (!this.watching) say($("outcome"));
     const outcome = await this.writer.ask(panel.target(cell));
     if (outcome === null) return;
+    // A reload of the gateway may have taken the right to write.
+    if (outcome === "refused") await this.may.ask().catch(() => {});
     const told = WRITTEN[outcome];
     const { device } = panel.part;
     const isShown = () => this.panels.includes(panel) && this.device === device;
@@ -349,6 +352,7 @@ export class Values {
       const describe = !this.polls || wanted.some((part) => part.source?.profile);
       const more = { interval: this.interval, maxStreams: MAX_STREAMS.watch, describe };
       try {
+        if (told !== null) await this.may.ask();
         await stream(PATH, this.sent(wanted, more, stopping.signal), (name, data) => {
           if (this.watching !== stopping) return;
           if (name === "view") {
@@ -397,9 +401,9 @@ export class Values {
     if (first) this.plotted?.forEach((key) => this.plots.choose(key));
   }
 
-  /** Returns whether the tables have the tags of an event. */
+  /** Returns whether the tables have the tags of an event, and offer writes if the gateway allows them. */
   fits(data) {
-    return data.parts.every((each, at) => !each.tags || parts.same(each.tags, this.panels[at].tags));
+    return this.offers === this.may.write && data.parts.every((each, at) => !each.tags || parts.same(each.tags, this.panels[at].tags));
   }
 
   /** Takes the values of an event. */
