@@ -551,6 +551,7 @@ def test_the_next_address_of_a_name_is_tried(device: tuple[str, int]) -> None:
         ("/connect", {"host": PLC, "transport": "tls", "serverName": "a b"}, "serverName"),
         ("/connect", {"host": PLC, "transport": "tls", "serverName": "plc-"}, 'is "plc-"'),
         ("/connect", {"host": PLC, "unitid": 3}, '"unitid" is not a parameter'),
+        ("/connect?unitId=3", {"host": PLC}, 'query is "unitId=3", allowed: none beside a body'),
         ("/read", {"functionCode": 5}, "Invalid read function code: 0x5"),
         ("/read", {"functionCode": 6}, "Invalid read function code: 0x6"),
         ("/read", {"functionCode": 16}, "Invalid read function code: 0x10"),

@@ -193,7 +193,7 @@ def test_a_query_that_is_sent_again_is_answered_anew(app: App, memory: holdfast.
         (b"[-Infinity]", "-Infinity is out of range"),
         (b"[1e999]", "1e999 is out of range"),
         (b"[-0.1e-999]", "-0.1e-999 is out of range"),
-        (b"[" + b"9" * 5000 + b"]", "4300 digits"),
+        (b"[-" + b"9" * 5000 + b"]", "an integer has 5000 digits, allowed: 4300"),
         (b'["\\ud800"]', "surrogate"),
         (b'["\xff"]', "can't decode byte 0xff"),
         (b"\xff\xfe[\x00]\x00", "can't decode byte 0xff"),
@@ -208,6 +208,16 @@ def test_what_is_not_json_is_told_by_its_place(body: bytes, says: str) -> None:
     assert raised.value.detail.startswith("the body is not JSON: ")
     assert says in raised.value.detail
     assert len(raised.value.detail) < 130
+
+
+def test_a_query_beside_a_body_is_refused(app: App, memory: holdfast.Memory) -> None:
+    async def test() -> None:
+        answer = at_once(app(whole("POST", web.INGEST, COMMAND, query=b"value=1")))
+        assert answer.status == 400
+        assert b"allowed: none beside a body" in answer.body
+
+    run(test)
+    assert memory.read("coils", 0, 1) == [0]
 
 
 @pytest.mark.parametrize("body", [b'{"a":1,"a":1}', b'[{"b":{"a":1,"c":2,"a":3}}]'])

@@ -145,11 +145,12 @@ class App(Application):
         return super().__call__(request)
 
     def check_type(self, request: Request) -> None:
-        """Raises `BadRequest` for a body that is not JSON by its type."""
+        """Raises `BadRequest` for a body that is not JSON by its type, or has a query beside it."""
         if request.path in self._lenient:
             port_of_call.check_type(request)
         else:
             request.check_json(b"", FORM, parameters=True)
+            request.check_no_query()
 
     def not_allowed(self, operation: Operation[Any]) -> str:
         """Returns the error for another method."""

@@ -108,8 +108,9 @@ class Application:
         return f"allowed: {operation.methods}"
 
     def check_type(self, request: Request) -> None:
-        """Raises `BadRequest` for a body that is not JSON by its type."""
+        """Raises `BadRequest` for a body that is not JSON by its type, or has a query beside it."""
         request.check_json()
+        request.check_no_query()
 
     # Steps.
 

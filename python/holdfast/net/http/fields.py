@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import sys
 from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -136,8 +137,18 @@ def _float(text: str) -> float:
     return value
 
 
+def _integer(text: str) -> int:
+    digits, most = len(text.lstrip("-")), sys.get_int_max_str_digits()
+    if 0 < most < digits:  # 0 is no limit.
+        raise ValueError(f"an integer has {digits} digits, allowed: {most}")
+    return int(text)
+
+
 _DECODER = json.JSONDecoder(
-    object_pairs_hook=_without_duplicates, parse_float=_float, parse_constant=_float
+    object_pairs_hook=_without_duplicates,
+    parse_float=_float,
+    parse_int=_integer,
+    parse_constant=_float,
 )
 
 

@@ -210,6 +210,12 @@ class Request:
             )
         self.check_uncompressed()
 
+    def check_no_query(self) -> None:
+        """Raises `BadRequest` for parameters beside a body that has all fields."""
+        if self.query:
+            found = shown(self.query.decode("latin-1"))
+            raise BadRequest("malformed", f"the query is {found}, allowed: none beside a body")
+
     def check_uncompressed(self) -> None:
         """Raises `BadRequest` for a compressed body."""
         coding = self.header(b"content-encoding")
