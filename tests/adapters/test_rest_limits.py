@@ -399,6 +399,8 @@ GARBAGE = [
     web.head("POST", web.INGEST, "Content-Length: 1", "Content-Length: 2") + b"xx",
     web.head("POST", web.INGEST, "Content-Length: 5", "Transfer-Encoding: chunked") + b"0\r\n\r\n",
     web.head("POST", web.INGEST, "Transfer-Encoding: chunked", "Content-Length: 5") + b"0\r\n\r\n",
+    web.head("POST", web.INGEST, "Transfer-Encoding: gzip, chunked") + b"0\r\n\r\n",
+    web.head("POST", web.INGEST, *2 * ["Transfer-Encoding: chunked"]) + b"0\r\n\r\n",
     web.head("POST", web.INGEST, "Transfer-Encoding: gzip") + b"x",
     web.head("POST", web.INGEST, "Transfer-Encoding: chunked, gzip") + b"x",
     web.head("POST", web.INGEST, "Transfer-Encoding: xchunked") + b"0\r\n\r\n",

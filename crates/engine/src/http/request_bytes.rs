@@ -76,13 +76,19 @@ pub(super) struct HeadEnd {
     line: Vec<u8>,
     has_lines: bool,
     has_length: bool,
-    has_coding: bool,
+    /// How many lines name a coding.
+    codings: usize,
+    /// Whether one of them names another than the chunks alone.
+    has_other_coding: bool,
     /// Whether hyper has read a part of it.
     is_begun: bool,
 }
 
 const LENGTH: &[u8] = b"content-length:";
 const CODING: &[u8] = b"transfer-encoding:";
+
+/// The beginning of a line that is kept: enough for the name and value of a coding.
+const KEPT_LINE_BYTES: usize = CODING.len() + 32;
 
 impl HeadEnd {
     fn find(&mut self, bytes: &[u8]) -> usize {
@@ -96,7 +102,7 @@ impl HeadEnd {
                 b'\n' if self.line.is_empty() => self.search.found = Some(self.search.searched),
                 b'\n' => self.end_line(),
                 b'\r' => {}
-                _ if self.line.len() < CODING.len() => self.line.push(byte.to_ascii_lowercase()),
+                _ if self.line.len() < KEPT_LINE_BYTES => self.line.push(byte.to_ascii_lowercase()),
                 _ => {}
             }
         }
@@ -118,14 +124,17 @@ impl HeadEnd {
     fn end_line(&mut self) {
         self.has_lines = true;
         self.has_length |= self.line.starts_with(LENGTH);
-        self.has_coding |= self.line.starts_with(CODING);
+        if let Some(coding) = self.line.strip_prefix(CODING) {
+            self.codings += 1;
+            self.has_other_coding |= coding.trim_ascii() != b"chunked";
+        }
         self.line.clear();
     }
 
-    /// Whether the header has both Content-Length and Transfer-Encoding. hyper would accept it, but
-    /// proxies disagree about its end: request smuggling (RFC 9112, 6.1 and 11.2).
+    /// Whether the header has both Content-Length and Transfer-Encoding, or another coding than the chunks alone.
+    /// hyper would accept it, but proxies disagree about its end: request smuggling (RFC 9112, 6.1 and 11.2).
     pub(super) fn is_ambiguous(&self) -> bool {
-        self.has_length && self.has_coding
+        self.has_length && self.codings > 0 || self.codings > 1 || self.has_other_coding
     }
 }
 
@@ -241,15 +250,22 @@ mod tests {
     }
 
     #[test]
-    fn a_length_beside_a_coding_is_noticed_wherever_it_is_cut() {
-        let header =
-            b"POST / HTTP/1.1\r\nTransfer-encoding: chunked\r\nX: y\r\nCONTENT-LENGTH: 5\r\n\r\n";
-        for cut in 0..header.len() {
-            let mut end = HeadEnd::default();
-            end.find(&header[..cut]);
-            end.search.skip(cut);
-            end.find(&header[cut..]);
-            assert!(end.is_ambiguous());
+    fn what_proxies_could_read_otherwise_is_noticed_wherever_it_is_cut() {
+        for (fields, is_ambiguous) in [
+            ("Transfer-encoding: chunked\r\nX: y\r\nCONTENT-LENGTH: 5", true),
+            ("Transfer-Encoding: gzip, chunked", true),
+            ("Transfer-Encoding: chunked\r\nTransfer-Encoding: chunked", true),
+            ("Transfer-Encoding:  Chunked\t", false),
+            ("Content-Length: 5", false),
+        ] {
+            let header = format!("POST / HTTP/1.1\r\n{fields}\r\n\r\n").into_bytes();
+            for cut in 0..header.len() {
+                let mut end = HeadEnd::default();
+                end.find(&header[..cut]);
+                end.search.skip(cut);
+                end.find(&header[cut..]);
+                assert_eq!(end.is_ambiguous(), is_ambiguous, "{fields}");
+            }
         }
     }
 }
