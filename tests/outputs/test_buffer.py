@@ -127,6 +127,22 @@ def test_readings_that_come_while_others_are_stored_do_not_hold_up_the_output(
     assert (stored.count, len(buffer)) == (5, 11)
 
 
+def test_what_is_dropped_while_others_are_stored_is_counted(
+    opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    buffer = Buffer(2)
+    stored = buffer.stored = opened(tmp_path / "b.db")
+
+    def full(rows: Sequence[Sequence[Reading]]) -> int:
+        buffer.offer(polls(5, 100))
+        return sum(map(len, rows))
+
+    monkeypatch.setattr(stored, "add", full)
+    buffer.offer(polls(2))
+    buffer.keep(60)
+    assert buffer.dropped == 3 + 2
+
+
 def test_storing_ends_in_time_and_loses_nothing(opened: Opened, tmp_path: Path) -> None:
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")

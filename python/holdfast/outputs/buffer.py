@@ -67,13 +67,20 @@ class Buffer:
                     self._waiting.appendleft(oldest[excess:])
                 gone = min(excess, len(oldest))
                 self._count -= gone
-                self.dropped += gone
+                self._drop(gone)
             self._changed.notify_all()
 
-    def __len__(self) -> int:
-        stored = 0 if self.stored is None else self.stored.count
+    def _drop(self, count: int) -> None:
+        # Both threads count.
         with self._changed:
-            return self._count + (0 if self._is_batch_stored else len(self._batch)) + stored
+            self.dropped += count
+
+    def __len__(self) -> int:
+        # Diagnostics ask too, while the thread of the output may lose the file.
+        stored = self.stored
+        with self._changed:
+            waiting = self._count + (0 if self._is_batch_stored else len(self._batch))
+            return waiting + (0 if stored is None else stored.count)
 
     def take(self, max_readings: int, timeout: float) -> list[Reading]:
         """Returns the oldest readings. Waits for the first up to `timeout` seconds.
@@ -88,7 +95,7 @@ class Buffer:
             with self._losing_file():
                 self._batch = self.stored.first(max_readings)
             self._is_batch_stored = bool(self._batch)
-            self.dropped += self.stored.damaged
+            self._drop(self.stored.damaged)
             self.stored.damaged = 0
             return self._batch
         with self._changed:
@@ -163,7 +170,7 @@ class Buffer:
                 return has_moved
             try:
                 with self._losing_file():
-                    self.dropped += self.stored.add(rows)
+                    self._drop(self.stored.add(rows))
             except BaseException:
                 if rows[0] is not self._batch:
                     self._put_back(*rows)
@@ -179,7 +186,7 @@ class Buffer:
         try:
             yield
         except FileGone as gone:
-            self.dropped += gone.lost
+            self._drop(gone.lost)
             self.stored, self._is_batch_stored = None, False
             raise
 
