@@ -341,6 +341,21 @@ def test_a_file_that_is_damaged_at_the_start_is_left_under_another_name(
     assert (tmp_path / "b.db.damaged").exists()
 
 
+def test_a_file_that_can_not_be_read_any_more_is_left_under_another_name(
+    opened: Opened, tmp_path: Path
+) -> None:
+    """As on a bad sector. Trying again would hold up all values."""
+    buffer = Buffer()
+    stored = buffer.stored = opened(tmp_path / "b.db")
+    stored.add([numbered(3)])
+    stored._db.set_progress_handler(lambda: True, 1)
+    buffer.offer(polls(2, 3))
+    with pytest.raises(FileGone, match=r"b\.db: interrupted; it is .*b\.db\.damaged now"):
+        buffer.take(1, 0)
+    assert buffer.dropped == 3
+    assert drained(buffer) == [3, 4]
+
+
 @pytest.mark.parametrize("error", [OSError, RuntimeError])
 def test_what_can_not_be_stored_stays_in_memory(
     opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
@@ -477,6 +492,27 @@ def test_a_row_that_can_not_be_read_is_dropped_and_counted(
     buffer.stored = stored
     assert drained(buffer) == [3, 4]
     assert (buffer.dropped, len(buffer)) == (3, 0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "UPDATE readings SET data = CAST(x'c1ff' AS TEXT) WHERE id = 1",
+        "UPDATE tags SET description = CAST(x'7bff' AS TEXT) WHERE description LIKE '%float32%'",
+    ],
+    ids=["data", "description"],
+)
+def test_a_row_with_a_text_that_is_not_utf_8_is_dropped_and_counted(
+    opened: Opened, tmp_path: Path, change: str
+) -> None:
+    stored = opened(tmp_path / "b.db", known=[])
+    stored.add([[reading(1.5, tag=tag("gone", type="float32"))]])
+    stored.add([numbered(2, 3)])
+    assert stored._db.execute(change).rowcount == 1
+    buffer = Buffer()
+    buffer.stored = stored
+    assert drained(buffer) == [3, 4]
+    assert (buffer.dropped, len(buffer)) == (1, 0)
 
 
 def test_a_value_of_a_changed_tag_keeps_its_meaning(opened: Opened, tmp_path: Path) -> None:

@@ -441,8 +441,14 @@ def test_a_file_from_which_nothing_can_be_removed_stops_nothing(
     assert (count(caplog, "output_file_failed"), count(caplog, "output_failed")) == (1, 0)
 
 
-def test_a_damaged_file_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize("is_aside", [True, False])
+def test_a_damaged_file_stops_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, is_aside: bool
+) -> None:
+    """Nor if it can't be renamed: it is not opened again, to fail at the same place."""
     file = tmp_path / "b.db"
+    if not is_aside:
+        (tmp_path / "b.db.damaged").mkdir()
     stored = Stored(file, 2**30, lambda *_: tag())
     for start in range(0, 5000, 1000):
         stored.add([numbered(1000, start)])
@@ -453,10 +459,13 @@ def test_a_damaged_file_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureF
         damaged.write(b"\xa5" * 4096)
     output = Running(file)
     wire.until(lambda: output.buffer.dropped, "the rest of the file is lost")
-    output.buffer.offer(polls(5, 5000))
-    wire.until(lambda: output.receiver.sent[-5:] == list(range(5000, 5005)), "all is sent")
+    for number in range(5000, 5005):
+        output.buffer.offer(polls(1, number))
+        wire.until(lambda: output.receiver.sent[-1:] == [number], "it is sent")  # noqa: B023
     output.end()
     assert len(output.receiver.sent) + output.buffer.dropped == 5005
+    assert file.exists()
+    assert (output.sending.status()["file_error"] is None) is is_aside
     assert count(caplog, "output_file_failed") == count(caplog, "output_dropped") == 1
     assert count(caplog, "output_failed") == 0
 

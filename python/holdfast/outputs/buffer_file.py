@@ -67,6 +67,8 @@ class Stored:
                 file, timeout=lock_timeout, isolation_level=None, check_same_thread=False
             )
         with self._errors(self.close):
+            # A text that is not UTF-8 spoils only the row that needs it, in `first`.
+            self._db.text_factory = bytes
             # Two processes with one file would each send the readings of the other.
             self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
@@ -114,7 +116,8 @@ class Stored:
         """The oldest readings, in whole rows: one, and more up to `most` readings. Empty if there
         are none.
 
-        Removes those that can't be read, and counts them in `damaged`.
+        Removes those that can't be decoded, and counts them in `damaged`. If the file itself can't
+        be read, it is `FileGone`: trying again would hold up all that comes behind.
         """
         query = "SELECT id, data, count FROM readings WHERE id > ? ORDER BY id LIMIT 1"
         found: list[Reading] = []
@@ -129,11 +132,10 @@ class Stored:
                     return found
                 id, data, count = row
                 readings = [self._reading(*plain) for plain in _decoded(data)]
-            except sqlite3.Error:
+            except sqlite3.Error as error:
                 if found:
                     return found
-                with self._errors():
-                    raise
+                raise self._gone(f"{self.file}: {error}", self.count + self.damaged) from error
             except (msgspec.MsgspecError, TypeError, ValueError):
                 if found:
                     return found
@@ -196,8 +198,7 @@ class Stored:
             "SELECT coalesce(sum(count) FILTER (WHERE id > ?), 0), coalesce(sum(length(data)), 0) "
             "FROM readings"
         )
-        with self._errors():
-            self.count, self._bytes = self._db.execute(query, (self._sent,)).fetchone()
+        self.count, self._bytes = self._db.execute(query, (self._sent,)).fetchone()
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
@@ -223,13 +224,17 @@ class Stored:
             code = getattr(error.__cause__, "sqlite_errorcode", sqlite3.SQLITE_ERROR)
             if code & 0xFF != sqlite3.SQLITE_CORRUPT:
                 raise
-            self.close()
-            aside = self.file.with_name(f"{self.file.name}.damaged")
-            try:
-                self.file.replace(aside)
-            except OSError as failed:
-                raise FileGone(f"{error}; it can't become {aside}: {failed}", 0) from error
-            raise FileGone(f"{error}; it is {aside} now", waiting) from error
+            raise self._gone(str(error), waiting) from error
+
+    def _gone(self, error: str, lost: int) -> FileGone:
+        """Leaves the file under another name, if that can be."""
+        self.close()
+        aside = self.file.with_name(f"{self.file.name}.damaged")
+        try:
+            self.file.replace(aside)
+        except OSError as failed:
+            return FileGone(f"{error}; it can't become {aside}: {failed}", lost, stays=True)
+        return FileGone(f"{error}; it is {aside} now", lost)
 
     def _reading(
         self,

@@ -269,7 +269,8 @@ class Sending:
 
     def _log_unsent(self) -> None:
         """Logs what is lost."""
-        unsent = len(self._buffer) - (self._buffer.stored.count if self._buffer.stored else 0)
+        stored = self._buffer.stored
+        unsent = len(self._buffer) - (0 if stored is None else stored.count)
         if unsent > 0:
             log_lines.write(logging.WARNING, "output_unsent", output=self._name, count=unsent)
 
@@ -338,3 +339,6 @@ class Sending:
                     logging.ERROR, "output_file_failed", output=self._name, error=message
                 )
             self._file_error = message
+            if isinstance(error, FileGone) and error.stays:
+                # Opened again, it would fail at the same place.
+                self._open_file = None

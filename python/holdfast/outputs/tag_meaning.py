@@ -23,7 +23,7 @@ def described(tag: Tag) -> str:
     return json.dumps((tag.area, tag.type, scale, tag.offset, tag.unit, [*tag.states.items()]))
 
 
-def tag_from(name: str, text: str) -> Tag:
+def tag_from(name: str, text: str | bytes) -> Tag:
     """A tag of the same meaning as one that was described, for values that were read."""
     area, type, scale, offset, unit, states = json.loads(text)
     if isinstance(scale, list):
