@@ -341,6 +341,31 @@ def test_a_file_that_is_damaged_at_the_start_is_left_under_another_name(
     assert (tmp_path / "b.db.damaged").exists()
 
 
+def test_a_file_that_is_damaged_near_its_end_is_sent_up_to_there(
+    opened: Opened, tmp_path: Path
+) -> None:
+    """What is behind the damage counts as dropped, as far as it can be counted."""
+    file = tmp_path / "b.db"
+    stored = opened(file)
+    for start in range(0, 5000, 10):
+        stored.add([numbered(10, start)])
+    [pages] = stored._db.execute("PRAGMA page_count").fetchone()
+    stored.close()
+    damage(file, pages - 1)
+    buffer = Buffer()
+    buffer.stored = opened(file)
+    waiting = len(buffer)
+    found: list[int] = []
+    with pytest.raises(FileGone, match="malformed"):  # noqa: PT012
+        while readings := buffer.take(1000, 0):
+            found += numbers(readings)
+            buffer.done()
+    assert found == list(range(len(found)))
+    assert len(found) > 4500
+    assert len(found) + buffer.dropped == waiting < 5000
+    assert buffer.dropped > 0
+
+
 def test_a_file_that_can_not_be_read_any_more_is_left_under_another_name(
     opened: Opened, tmp_path: Path
 ) -> None:

@@ -198,7 +198,23 @@ class Stored:
             "SELECT coalesce(sum(count) FILTER (WHERE id > ?), 0), coalesce(sum(length(data)), 0) "
             "FROM readings"
         )
-        self.count, self._bytes = self._db.execute(query, (self._sent,)).fetchone()
+        try:
+            self.count, self._bytes = self._db.execute(query, (self._sent,)).fetchone()
+        except sqlite3.Error:
+            # What is before the damage can be sent; what is behind it counts as lost later.
+            count = size = last = 0
+            for order in ("ASC", "DESC"):
+                rows = (
+                    f"SELECT id, count, length(data) FROM readings WHERE id > ? ORDER BY id {order}"
+                )
+                with contextlib.suppress(sqlite3.Error):
+                    for id, waiting, length in self._db.execute(rows, (last,)):
+                        last = id
+                        count += waiting if id > self._sent else 0
+                        size += length
+            if not count:
+                raise
+            self.count, self._bytes = count, size
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
