@@ -12,10 +12,18 @@ import pytest
 from holdfast._core import Request
 from support import wire
 from support.fake_device import Stream
-from support.native_poller import EXPIRED, ReportingPoller, device, taken, written
+from support.native_poller import (
+    EXPIRED,
+    RESET,
+    Made,
+    ReportingPoller,
+    device,
+    taken,
+    written,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from support.fake_device import Asked
 
@@ -67,6 +75,32 @@ def test_a_write_that_waits_for_another_device_of_its_connection(
         assert not line.writes
         poller.add(made("b", timeout=wire.DEADLINE))
         assert written(poller, poller.write("b", WRITE, within=wire.DEADLINE)) == 0
+        assert len(line.writes) == 1
+
+
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda poller, _: poller.remove("a"),
+        lambda poller, made: poller.replace("a", made("a", unit=3)),
+    ],
+    ids=["removed", "another unit"],
+)
+def test_a_write_that_waits_is_not_sent_once_its_device_has_gone(
+    poller: ReportingPoller, kind: str, change: Callable[[ReportingPoller, partial[Made]], object]
+) -> None:
+    with busy(kind) as line:
+        made = partial(device, line, transport=kind, timeout=4 * wire.DEADLINE)
+        poller.add(made("slow", unit=2))
+        assert line.is_reading.wait(wire.DEADLINE)
+        poller.add(made("a"))
+        number = poller.write("a", WRITE)
+        change(poller, made)
+        assert written(poller, number) == RESET
+        line.go_on.set()
+        poller.add(made("b"))
+        assert written(poller, poller.write("b", WRITE)) == 0
         assert len(line.writes) == 1
 
 

@@ -103,7 +103,7 @@ def test_a_write_waits_for_the_read_under_way_and_goes_before_the_next(
         assert [each.pdu[0] for each in fake.requests] == [3, 6, 3, 3]
 
 
-def test_the_end_of_a_device_does_not_break_a_write_off(poller: ReportingPoller) -> None:
+def test_the_end_of_a_device_ends_the_writes_that_were_not_sent(poller: ReportingPoller) -> None:
     begun, go_on = threading.Event(), threading.Event()
 
     def answer(request: wire.Frame) -> bytes:
@@ -114,11 +114,14 @@ def test_the_end_of_a_device_does_not_break_a_write_off(poller: ReportingPoller)
 
     with Fake(answer) as fake:
         poller.add(device(fake))
-        number = poller.write("a", Request.write_register(0, 1))
+        number, *waiting = [poller.write("a", Request.write_register(0, 1)) for _ in range(3)]
         assert begun.wait(wire.DEADLINE)
         assert poller.remove("a")
+        _, writes = taken(poller, lambda _, writes: len(writes) == 2)
+        assert sorted(writes) == [(each, RESET) for each in waiting]
         go_on.set()
         assert written(poller, number) == 0
+        assert [each.pdu[0] for each in fake.requests].count(6) == 1
 
 
 def test_the_end_of_a_poller_ends_the_wait_for_results() -> None:

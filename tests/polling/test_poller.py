@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -338,6 +339,21 @@ def test_devices_at_one_address_have_equal_options(
     assert list(poller.counters()) == ["c"]
 
 
+def test_a_device_that_is_added_again_has_its_own_options(poller: Poller) -> None:
+    tags = {"x": ("holding_registers", 5)}
+
+    def first(url: str) -> Reading:
+        poller.add(url, tags, name="a", interval=0.01, timeout=wire.DEADLINE)
+        [reading, *_] = taken(poller)
+        poller.remove("a")
+        return reading
+
+    with Stream("tcp", then=lambda asked: asked.answer(unit=9)) as server:
+        assert first(f"{server.url}?accept_unit=any").value == 5
+        assert first(server.url).error == "an invalid reply"
+        assert first(f"{server.url}?accept_unit=9").value == 5
+
+
 def test_the_end_ends_the_iteration(device: holdfast.Server) -> None:
     with Poller() as poller:
         poller.add(url(device), {"x": ("coils", 3)}, interval=0.05)
@@ -452,6 +468,36 @@ def test_a_write_needs_a_scale_that_was_read(poller: Poller, device: holdfast.Se
 def adapter(device: Path, value: int) -> Serial:
     """A serial adapter. Registers of all units at its line have one value."""
     return Serial(RTU, device, then=lambda asked: asked.answer(registers(asked.pdu, value)))
+
+
+def test_a_line_is_closed_before_it_is_opened_with_other_settings(
+    poller: Poller, device: holdfast.Server, tmp_path: Path
+) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def hold(asked: Asked) -> None:
+        begun.set()
+        assert go_on.wait(wire.DEADLINE)
+        asked.answer()
+
+    tags = {"x": ("holding_registers", 5)}
+    with Serial(RTU, tmp_path / "line", hold) as line:
+        poller.add(line.url, tags, name="a", timeout=2 * wire.DEADLINE)
+        assert begun.wait(wire.DEADLINE)
+        poller.remove("a")
+        poller.add(f"{line.url}&close_after=3", tags, name="b", timeout=2 * wire.DEADLINE)
+        poller.add(url(device), {"y": ("coils", 3)}, name="other", interval=0.01)
+        wire.until(lambda: poller.counters()["other"]["polls"] >= 5, "b had time to open it")
+        go_on.set()
+        found: list[Reading] = []
+
+        def is_read() -> bool:
+            found.extend(each for each in taken(poller) if each.device == "b")
+            return bool(found)
+
+        wire.until(is_read, "b is read")
+        assert (found[0].value, found[0].error) == (5, None)
+        poller.close()
 
 
 def plugged(link: Path, device: Path) -> None:

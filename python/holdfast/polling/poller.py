@@ -169,7 +169,10 @@ class Poller:
         return name if name not in self._core_names else f"{name}#{next(self._names)}"
 
     def remove(self, name: str) -> None:
-        """Stops polling a device. Raises `KeyError` for an unknown name."""
+        """Stops polling a device. Writes to it that wait are not sent, and fail.
+
+        Raises `KeyError` for an unknown name.
+        """
         core_name = self._core_names.pop(name)
         del self._readers[core_name]
         place = self._places.pop(core_name)
@@ -184,7 +187,7 @@ class Poller:
 
         Returns when the device has confirmed it. Raises `KeyError` for an unknown device or tag,
         `ValueError` for a tag that is not `writable` or a value that does not fit, `WriteFailed`,
-        also for a `close` meanwhile, and `RuntimeError` after `close`.
+        also for a `remove` or `close` meanwhile, and `RuntimeError` after `close`.
         """
         core_name = self._core_names[name]
         of = self._readers[core_name].named.get(tag)

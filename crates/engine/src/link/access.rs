@@ -1,12 +1,12 @@
 //! A link as the poller uses it: its requests, in turns with those of others.
 
-use std::cell::Cell;
+use std::cell::{Cell, RefCell};
 use std::rc::Rc;
 use std::sync::Arc;
 use std::time::Duration;
 
 use holdfast_protocol::client::InvalidResponse;
-use holdfast_protocol::pdu::{EncodedRequest, ResponseError};
+use holdfast_protocol::pdu::{EncodedRequest, Request, ResponseError};
 use holdfast_runtime::Retry;
 use tokio::time::Instant;
 
@@ -31,6 +31,8 @@ pub(crate) struct Link {
     breakers: CircuitBreakers,
     /// Grows whenever a device may have changed by a request.
     pub(super) changes: Cell<u64>,
+    /// The links to this address before it, until they are closed.
+    before: RefCell<Vec<Rc<Link>>>,
 }
 
 pub(super) enum Wire {
@@ -52,7 +54,28 @@ impl Link {
             _ => (Wire::Blocking(BlockingLink::new(endpoint, retry)), one),
         };
         let (pace, breakers) = (Pace::new(in_flight), CircuitBreakers::new(retry));
-        Rc::new(Link { pace, wire, retry, breakers, changes: Cell::default() })
+        let (changes, before) = Default::default();
+        Rc::new(Link { pace, wire, retry, breakers, changes, before })
+    }
+
+    /// Sends nothing until a link to the same address, which nobody uses any more, is closed: a line, and many
+    /// a device, has only one connection.
+    pub(crate) fn follow(&self, before: Rc<Link>) {
+        let mut all = before.before.take();
+        all.push(before);
+        self.before.replace(all);
+    }
+
+    /// Closes the connection behind the requests that were sent.
+    pub(crate) async fn close(&self) {
+        let _alone: Alone<'_> = self.pace.alone(POLLER, Priority::Urgent).await;
+        self.release();
+        if let Wire::Blocking(link) = &self.wire {
+            // Its thread has closed the connection when it refuses this one.
+            let (unit_id, request) = (0, EncodedRequest::new(&Request::ReadExceptionStatus));
+            let unwanted = Permit { wanted: Some(Arc::new(|_| false)), ..Permit::default() };
+            let _ = link.exchange(unit_id, &request, Duration::ZERO, true, &unwanted).await;
+        }
     }
 
     /// Whether a request of a client with this function must fail fast.
@@ -120,6 +143,11 @@ impl Link {
         eager: bool,
         permit: &Permit,
     ) -> Exchanged {
+        let before = self.before.borrow().clone();
+        for link in &before {
+            link.close().await;
+        }
+        self.before.borrow_mut().clear();
         self.note_change(request);
         let answer = match &self.wire {
             Wire::Tcp(link) => {
@@ -166,7 +194,7 @@ impl Link {
 
 #[cfg(test)]
 mod tests {
-    use holdfast_protocol::pdu::{Range, Request};
+    use holdfast_protocol::pdu::Range;
     use tokio::runtime::Builder;
     use tokio::task::LocalSet;
 

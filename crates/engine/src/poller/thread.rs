@@ -2,12 +2,13 @@
 
 use std::cell::RefCell;
 use std::collections::{HashMap, HashSet};
+use std::future;
 use std::io;
 use std::net::IpAddr;
 use std::ptr;
 use std::rc::{self, Rc};
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, Weak};
+use std::sync::{Arc, Mutex, OnceLock, Weak};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -17,7 +18,7 @@ use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, limit};
 use holdfast_runtime::{Retry, lock};
 use thiserror::Error;
 use tokio::runtime::Builder;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, watch};
 use tokio::task::{AbortHandle, LocalSet, spawn_local};
 
 use super::destination::{ReadSettings, mirrors};
@@ -33,8 +34,8 @@ use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::{Endpoint, Place};
 use crate::heartbeat::Heartbeat;
 use crate::link::{
-    Call, Fault, Fence, InFlight, Link, LinkSettings, Permit, Priority, SharedLink, Stage, fault,
-    serve,
+    Call, Fault, Fence, InFlight, Link, LinkSettings, Permit, Priority, SharedLink, Stage, Wanted,
+    fault, serve,
 };
 use crate::own_threads::OwnThreads;
 use crate::tls::client::Identity;
@@ -368,8 +369,8 @@ impl Poller {
         Ok(ticket)
     }
 
-    /// Stops polling a device. Its connection is closed when no other device uses it. Returns
-    /// whether there was a device of that name.
+    /// Stops polling a device. Its connection is closed when no other device uses it. Writes that were not
+    /// sent end with [`Fault::Reset`]. Returns whether there was a device of that name.
     pub fn remove(&self, name: &str) -> bool {
         let mut all = lock(&self.polled);
         let known = all.remove(name).is_some();
@@ -411,7 +412,7 @@ impl Drop for Poller {
 
 /// A device as the thread of the poller sees it.
 struct Running {
-    link: Rc<Link>,
+    link: Rc<UsedLink>,
     turn: Rc<Turn>,
     unit_id: u8,
     timeout: Duration,
@@ -420,6 +421,8 @@ struct Running {
     /// What is read from it now. Writes that are under way look here, and see nothing once their device
     /// is gone.
     reads: Rc<RefCell<Vec<ReadSettings>>>,
+    /// Writes that were not sent end with it.
+    writes: watch::Sender<()>,
     inbox: Rc<Inbox>,
     device: AbortHandle,
     forwards: Vec<RunningForward>,
@@ -494,7 +497,11 @@ async fn run_commands(
             Command::Stop => return,
             Command::Serve(settings, shared, calls) => {
                 let link = links.to(&settings.endpoint, (settings.in_flight, settings.retry));
-                spawn_local(serve(link, *settings, shared, calls));
+                // It is in use until nobody can call it any more.
+                spawn_local(async move {
+                    serve(Rc::clone(&link.0), *settings, shared, calls).await;
+                    drop(link);
+                });
             }
             Command::Forget(address) => {
                 links.by_address.remove(&address);
@@ -502,8 +509,11 @@ async fn run_commands(
             Command::Remove(name) => {
                 let removed = running.remove(&name);
                 debug_assert!(removed.is_some(), "{SAME_AS_LIST}");
-                drop(removed);
-                links.device_left();
+                if let Some(removed) = removed {
+                    let left = Rc::clone(&removed.link);
+                    drop(removed);
+                    links.device_left(left);
+                }
             }
             Command::Add(planned, polled) => {
                 let phase = schedule::first_poll(planned.settings.start_within, started);
@@ -521,6 +531,7 @@ async fn run_commands(
                 let link = links.to(endpoint, (*in_flight, *retry));
                 let before = running.remove(&name);
                 debug_assert!(before.is_some(), "{SAME_AS_LIST}");
+                let left = before.as_ref().map(|before| Rc::clone(&before.link));
                 fences.watch(planned.settings.fence.as_ref());
                 let name = planned.settings.name.clone();
                 let device = match before {
@@ -529,10 +540,15 @@ async fn run_commands(
                         device
                     }
                     // A panicked task cannot hand over to a new device.
-                    _ => Running::start(*planned, polled, link, Duration::ZERO),
+                    ended => {
+                        drop(ended);
+                        Running::start(*planned, polled, link, Duration::ZERO)
+                    }
                 };
                 running.insert(name, device);
-                links.device_left();
+                if let Some(left) = left {
+                    links.device_left(left);
+                }
             }
             Command::Write { device, ticket, request, until, to } => match running.get(&device) {
                 Some(device) => device.write(ticket, request, until, to),
@@ -559,17 +575,30 @@ impl Fences {
 
 impl Running {
     /// Starts the tasks of a device.
-    fn start(planned: Planned, polled: Polled, link: Rc<Link>, phase: Duration) -> Running {
+    fn start(planned: Planned, polled: Polled, link: Rc<UsedLink>, phase: Duration) -> Running {
         let inbox = Rc::new(Inbox::default());
         let DeviceSettings { unit_id, timeout, release, .. } = planned.settings;
         let fence = planned.settings.fence.clone();
         let reads = Rc::new(RefCell::new(planned.settings.reads.clone()));
         let turn = Rc::new(Turn::default());
-        let to = (Rc::clone(&link), Rc::clone(&turn));
+        let to = (Rc::clone(&link.0), Rc::clone(&turn));
         let state = Arc::clone(&polled.state);
         let (device, forwards) = made(planned, polled, to, Vec::new());
         let device = spawn_guarded(device.run(phase, Rc::clone(&inbox)), state);
-        Running { link, turn, unit_id, timeout, release, fence, reads, inbox, device, forwards }
+        let writes = watch::Sender::default();
+        Running {
+            link,
+            turn,
+            unit_id,
+            timeout,
+            release,
+            fence,
+            reads,
+            writes,
+            inbox,
+            device,
+            forwards,
+        }
     }
 
     /// Whether the task of the device has panicked. It does not end otherwise.
@@ -577,7 +606,7 @@ impl Running {
         self.device.is_finished()
     }
 
-    fn replace(&mut self, planned: Planned, polled: Polled, link: Rc<Link>, at_once: bool) {
+    fn replace(&mut self, planned: Planned, polled: Polled, link: Rc<UsedLink>, at_once: bool) {
         let settings = &planned.settings;
         let is_other = !Rc::ptr_eq(&self.link, &link) || self.unit_id != settings.unit_id;
         if is_other || mirrors(&self.reads.borrow()).ne(mirrors(&settings.reads)) {
@@ -588,13 +617,15 @@ impl Running {
             // Another device: writes that are under way are not its own.
             self.reads.take();
             self.reads = Rc::default();
+            self.writes = watch::Sender::default();
         }
         self.reads.borrow_mut().clone_from(&settings.reads);
         (self.unit_id, self.timeout) = (settings.unit_id, settings.timeout);
-        (self.release, self.link) = (settings.release, Rc::clone(&link));
+        (self.release, self.link) = (settings.release, link);
         self.fence.clone_from(&settings.fence);
         let before = std::mem::take(&mut self.forwards);
-        let (device, forwards) = made(planned, polled, (link, Rc::clone(&self.turn)), before);
+        let to = (Rc::clone(&self.link.0), Rc::clone(&self.turn));
+        let (device, forwards) = made(planned, polled, to, before);
         self.forwards = forwards;
         if at_once {
             device.want_soon();
@@ -602,8 +633,8 @@ impl Running {
         self.inbox.succeed(device);
     }
 
-    /// Sends a write between two reads, as soon as possible. Removing the device does not cancel
-    /// it.
+    /// Sends a write between two reads, as soon as possible. One that was sent has its result, even if the
+    /// device is removed.
     fn write(
         &self,
         ticket: u64,
@@ -611,18 +642,29 @@ impl Running {
         until: Option<Instant>,
         to: Arc<Results>,
     ) {
-        let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
+        let (link, turn) = (Rc::clone(&self.link.0), Rc::clone(&self.turn));
         let inbox = Rc::clone(&self.inbox);
         let Running { unit_id, timeout, release, .. } = *self;
         let until = until.map(|until| until + timeout);
-        let permit = Permit { fence: self.fence.clone(), until, wanted: None };
-        spawn_local(async move {
+        // Set once, by the thread of the link or by the end of the device.
+        let is_sent = Arc::new(OnceLock::new());
+        let mut device = self.writes.subscribe();
+        let (sent, of) = (Arc::clone(&is_sent), device.clone());
+        let wanted: Wanted = Arc::new(move |is_sent| match is_sent {
+            true => *sent.get_or_init(|| true),
+            false => of.has_changed().is_ok(),
+        });
+        let permit = Permit { fence: self.fence.clone(), until, wanted: Some(wanted) };
+        let withdrawn = async move {
+            let _ends = device.changed().await;
+            if *is_sent.get_or_init(|| false) {
+                future::pending::<()>().await;
+            }
+        };
+        let sending = async move {
             let fence = permit.fence.as_ref();
-            let refused = |fault| to.push_write(Written { ticket, outcome: Err(fault) });
-            let Some(taken) = permit.in_time(turn.take_to_write(fence, timeout)).await else {
-                return refused(Fault::Expired);
-            };
-            let Some(taken) = taken else { return refused(Fault::Standby) };
+            let taken = permit.in_time(turn.take_to_write(fence, timeout)).await;
+            let taken = taken.ok_or(Fault::Expired)?.ok_or(Fault::Standby)?;
             let answer = link.call(unit_id, &request, timeout, Priority::Urgent, &permit).await;
             drop(taken);
             if release || has_ended(fence) {
@@ -631,14 +673,21 @@ impl Running {
             if answer.is_ok() {
                 inbox.wake();
             }
-            let outcome = answer.map(drop).map_err(|error| fault(&error));
+            answer.map(drop).map_err(|error| fault(&error))
+        };
+        spawn_local(async move {
+            let outcome = tokio::select! {
+                biased;
+                () = withdrawn => Err(Fault::Reset),
+                outcome = sending => outcome,
+            };
             to.push_write(Written { ticket, outcome });
         });
     }
 
     /// Carries out a write of a Modbus client, between two reads.
     fn pass(&self, write: PassedWrite) {
-        let (link, turn) = (Rc::clone(&self.link), Rc::clone(&self.turn));
+        let (link, turn) = (Rc::clone(&self.link.0), Rc::clone(&self.turn));
         let (inbox, reads) = (Rc::clone(&self.inbox), Rc::clone(&self.reads));
         let Running { unit_id, timeout, release, .. } = *self;
         let permit = Permit { fence: self.fence.clone(), ..Permit::default() };
@@ -691,29 +740,56 @@ fn made(
     (Device::new(planned, polled.state, to, forwards), running)
 }
 
-/// The links to all addresses, each shared by all that ask for it.
+/// A link that devices or listeners use. What a removed device has sent may still hold the link itself.
+struct UsedLink(Rc<Link>);
+
+/// The last link to an address.
+struct KnownLink {
+    used: rc::Weak<UsedLink>,
+    link: rc::Weak<Link>,
+    settings: (Endpoint, InFlight, Retry),
+}
+
+/// The links to all addresses, each shared by all that ask for it while others use it.
 #[derive(Default)]
 struct Links {
-    by_address: HashMap<Address, rc::Weak<Link>>,
+    by_address: HashMap<Address, KnownLink>,
     /// How often a device has left its link since those without devices were removed.
     departures: usize,
 }
 
 impl Links {
-    fn to(&mut self, endpoint: &Endpoint, (in_flight, retry): (InFlight, Retry)) -> Rc<Link> {
-        let known = self.by_address.entry(address(endpoint)).or_default();
-        known.upgrade().unwrap_or_else(|| {
-            let link = Link::new(endpoint.clone(), in_flight, retry);
-            *known = Rc::downgrade(&link);
-            link
-        })
+    fn to(&mut self, endpoint: &Endpoint, (in_flight, retry): (InFlight, Retry)) -> Rc<UsedLink> {
+        let settings = (endpoint.clone(), in_flight, retry);
+        let address = address(endpoint);
+        let known = self.by_address.get(&address);
+        if let Some(used) = known.and_then(|known| known.used.upgrade()) {
+            return used;
+        }
+        let ending = known.and_then(|known| Some((known.link.upgrade()?, &known.settings)));
+        let link = match ending {
+            Some((link, of)) if *of == settings => link,
+            ending => {
+                let link = Link::new(endpoint.clone(), in_flight, retry);
+                ending.into_iter().for_each(|(before, _)| link.follow(before));
+                link
+            }
+        };
+        let used = Rc::new(UsedLink(Rc::clone(&link)));
+        let (link, in_use) = (Rc::downgrade(&link), Rc::downgrade(&used));
+        self.by_address.insert(address, KnownLink { used: in_use, link, settings });
+        used
     }
 
-    /// A device has left its link. Removing links looks at all of them, so it waits until it may find many.
-    fn device_left(&mut self) {
+    /// A device has left its link, which is closed if no one else uses it. Removing links looks at all of
+    /// them, so it waits until it may find many.
+    fn device_left(&mut self, left: Rc<UsedLink>) {
+        if let Some(UsedLink(link)) = Rc::into_inner(left) {
+            spawn_local(async move { link.close().await });
+        }
         self.departures += 1;
         if 2 * self.departures >= self.by_address.len() {
-            self.by_address.retain(|_, link| link.strong_count() > 0);
+            self.by_address.retain(|_, known| known.link.strong_count() > 0);
             self.departures = 0;
         }
     }
