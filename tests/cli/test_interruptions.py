@@ -10,7 +10,8 @@ import pytest
 
 from holdfast import SyncClient, _core
 from holdfast.cli.signals import Interrupted, ending_signals, interruptions
-from support.cli import invoke
+from support.cli import answer, invoke
+from support.fake_device import FakeDevice
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -97,6 +98,39 @@ def test_a_write_that_is_interrupted_was_possibly_carried_out(
     found = json.loads(result.output)
     assert (result.exit_code, found["ok"], found["reason"]) == (1, False, "interrupted")
     assert (found["target"], found["maybe_written"]) == (url, True)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_was_written_is_told_if_reading_it_back_is_interrupted(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    def answers(pdu: bytes) -> bytes | None:
+        if pdu[0] == 3:
+            signal.raise_signal(number)
+            return None
+        return pdu
+
+    file = tmp_path / "tags.yaml"
+    file.write_text("tags: {level: {area: holding_registers, address: 3, writable: true}}")
+    with FakeDevice(answers) as device:
+        url, options = device.url, ("--verify", "--timeout", "60")
+        plain, tagged = (
+            ("write", url, "hr", "3", "7"),
+            ("write", url, "level=7", "--tags", str(file)),
+        )
+        assert invoke(*plain, *options).stderr.splitlines() == [
+            "Written: holding_registers 3, 1 request; could not be read back",
+            f"holdfast: {url}: interrupted",
+        ]
+        assert invoke(*tagged, *options).output.splitlines() == [
+            "Written: level = 7",
+            "Could not be read back.",
+            f"holdfast: {url}: interrupted",
+        ]
+        for words, written in ((plain, 1), (tagged, ["level"])):
+            found = answer(*words, *options, code=1)
+            assert (found["ok"], found["reason"]) == (False, "interrupted")
+            assert (found["written"], found["maybe_written"]) == (written, False)
 
 
 @pytest.mark.parametrize("values", [(), ("--values",)])

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class WriteInterrupted(ModbusError):
-    """Ctrl-C has ended a write, which the device may carry out all the same."""
+    """Ctrl-C has ended a write, which the device may carry out all the same, or its check."""
 
     def __str__(self) -> str:
         return "interrupted"

@@ -129,7 +129,7 @@ def interruptions() -> Iterator[Signals]:
 
 @contextmanager
 def sigterm_as_ctrl_c() -> Iterator[None]:
-    """Lets SIGTERM raise `KeyboardInterrupt`, as Ctrl-C does, in a command that runs until it."""
+    """Lets SIGTERM raise `KeyboardInterrupt`, as Ctrl-C does."""
     before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         yield

@@ -20,6 +20,7 @@ from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import flag, json_option
 from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.value_type import typed, typed_options
+from holdfast.cli.signals import sigterm_as_ctrl_c
 from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
 from holdfast.cli.terminal_text import print_json
@@ -108,6 +109,7 @@ def write(
     Exit codes: 0 written, 1 not written, possibly not written or read back different, 2 wrong
     usage.
     """
+    click.get_current_context().with_resource(sigterm_as_ctrl_c())
     if files.given:
         from holdfast.cli.tags import write as tagged_write
 
@@ -186,7 +188,8 @@ def _carry_out(
             )
         try:
             differing = job.differing(client) if verify else {}
-        except ModbusError as error:
+        except (ModbusError, KeyboardInterrupt) as found:
+            error = device_errors.of_write(found)
             if not as_json:
                 click.echo(f"{job.summary}; could not be read back", err=True)
             certain = {**fields, "written": fields["count"], "maybe_written": False}

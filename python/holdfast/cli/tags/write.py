@@ -112,7 +112,8 @@ def _differing(
     """The values that were read back and differ, by name."""
     try:
         found = {write.tag.name: (write, write.read_back(client)) for write in writes}
-    except ModbusError as error:
+    except (ModbusError, KeyboardInterrupt) as ended:
+        error = device_errors.of_write(ended)
         names = [write.tag.name for write in writes]
         fields = {"target": of.url, "unit": of.unit, "written": names, "maybe_written": False}
         if not as_json:
