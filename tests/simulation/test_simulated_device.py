@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import itertools
 import math
 import re
@@ -18,6 +19,7 @@ from holdfast.simulation import generators, playback
 from holdfast.simulation.device import Refused, SimulatedDevice
 from holdfast.tags import Tag, TagList
 from holdfast.tags.scale import RegisterScale
+from holdfast.tags.text import text_of
 from support import cli
 
 if TYPE_CHECKING:
@@ -329,6 +331,29 @@ def test_infinity_is_played_back_and_null_in_an_array_repeats_its_item(tmp_path:
         found.append([*floats, *device.memory.read("holding_registers", 0, 2)])
         device.step()
     assert found == [[1.5, -math.inf, 1, 0], [-math.inf, 2, 1, 2], [-math.inf, 2, 1, 2]]
+
+
+def test_the_largest_floats_and_a_negative_zero_are_played_back(tmp_path: Path) -> None:
+    tags = TagList(
+        [
+            Tag("f32", "input_registers", 0, "float32"),
+            Tag("scaled", "input_registers", 2, "float32", scale=0.1),
+            Tag("pair", "input_registers", 4, "float32[2]"),
+        ]
+    )
+    most, minus_zero = [0x7F7F, 0xFFFF], [0x8000, 0]
+    of_zero = [*minus_zero, 0, 0, *minus_zero, *minus_zero]
+    file = tmp_path / "values.csv"
+    for registers in (most * 4, [each ^ 0x8000 for each in most] * 4, of_zero):
+        scaled = tags["scaled"].value(values.decode(registers[2:4], "float32"))
+        f32 = values.decode(registers[:2], "float32")
+        row = {"f32": f32, "scaled": scaled, "pair": [f32, f32]}
+        with file.open("w", newline="") as opened:
+            writer = csv.writer(opened)
+            writer.writerow(row)
+            writer.writerow(text_of(tags[name], value) for name, value in row.items())
+        device = SimulatedDevice(tags, played=playback.load(file, tags))
+        assert device.memory.read("input_registers", 0, 8) == registers
 
 
 def test_a_state_is_played_back_by_its_name(tmp_path: Path) -> None:

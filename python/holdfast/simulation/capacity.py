@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,8 @@ from holdfast.values.errors import shown
 from holdfast.values.numeric import limits, nearest_float
 
 if TYPE_CHECKING:
+    from fractions import Fraction
+
     from holdfast.tags import Tag
 
 _INFINITE = (math.inf, -math.inf)
@@ -34,9 +37,12 @@ def nearest(tag: Tag, value: Any) -> Any:
     if tag.is_float and value in _INFINITE:
         return math.copysign(value, value * tag.scale)
     least, most = _limits(tag)
-    number = _linear(tag).number(value)
+    linear = _linear(tag)
     if tag.is_float:
-        return nearest_float(min(most, max(least, float(number))), base)
+        # A fraction has no sign of zero.
+        exact = value if linear.is_identity else linear.number(value)
+        return nearest_float(min(most, max(least, float(exact))), base)
+    number = linear.number(value)
     raw = int(min(most, max(least, round(number))))
     near = itertools.chain(range(raw, int(least) - 1, -1), range(raw, int(most) + 1))
     return next(each for each in near if each not in tag.null)
@@ -97,10 +103,13 @@ class Capacity:
         if not tag.null and self._least <= value <= self._most:
             return
         number = _linear(tag).number(value)
-        raw = number if tag.is_float else round(number)
+        raw: float | Fraction = number if tag.is_float else round(number)
         if raw in tag.null:
             raise DoesNotFit(f"{tag.name}: found {self._text(value)}, which stands for no value")
         least, most = _limits(tag)
+        if tag.is_float:
+            with contextlib.suppress(OverflowError):  # It is outside then.
+                raw = nearest_float(float(raw), tag.of_type.base)
         if not least <= raw <= most:
             held = tag.value(nearest(tag, value))
             raise DoesNotFit(
