@@ -106,6 +106,11 @@ def test_no_answer_after_the_first_is_a_failure() -> None:
 
     with FakeDevice(answers) as device:
         result = invoke("bench", device.url, "hr:0", "10", *SHORT)
+        numbers = itertools.count()
+        found = answer("bench", device.url, "hr:0", "10", *SHORT, code=1)
+    assert (found["ok"], found["reason"], found["code"]) == (False, "exception", 4)
+    assert found["detail"] in found["errors"]
+    assert set(found["latency_ms"].values()) == {None}
     assert result.exit_code == 1
     assert re.search(r"requests +0\n", result.stdout)
     assert "exception 04 (Server Device Failure)" in result.stdout

@@ -126,6 +126,8 @@ class Load:
         """Seconds since the start of the test."""
         self.latencies = Latencies()
         self.errors: Counter[str] = Counter()
+        self.error: ModbusError | None = None
+        """The newest error."""
         self._clients = [
             Client(self.url, unit=self.unit, timeout=self.timeout, max_in_flight=self.in_flight)
             for _ in range(self.connections)
@@ -182,6 +184,7 @@ class Load:
                 await self._read(client)
             except ModbusError as error:
                 self.errors[_kind(error)] += 1
+                self.error = error
                 if isinstance(error, ConnectionLost):
                     await asyncio.sleep(min(RECONNECT_PAUSE_S, max(0.0, end - time.perf_counter())))
             else:

@@ -99,7 +99,7 @@ def bench(
         device_errors.fail(error, url, fields if as_json else None)
     answered = load.latencies.count > 0
     if as_json:
-        wrong = {} if answered else {"reason": "timeout", "detail": "no reply"}
+        wrong = {} if answered else device_errors.problem(load.error or "no reply")
         print_json({"ok": answered, **fields, **wrong, **_to_json(load)}, indent=2)
     else:
         what = f"{place.area} {place.address} to {place.address + count - 1}"
@@ -154,12 +154,15 @@ def _to_json(load: Load) -> dict[str, object]:
     """The results for JSON."""
     times = load.latencies
     latency = {name: times.quantile(share) for name, share in QUANTILES.items()}
-    latency |= {"mean": times.mean, "min": times.least if times.count else 0.0, "max": times.most}
+    latency |= {"mean": times.mean, "min": times.least, "max": times.most}
     return {
         "seconds": round(load.elapsed, 3),
         "requests": times.count,
         "rate": round(load.rate, 1),
-        "latency_ms": {name: round(seconds * 1e3, 4) for name, seconds in latency.items()},
+        "latency_ms": {
+            name: round(seconds * 1e3, 4) if times.count else None
+            for name, seconds in latency.items()
+        },
         "errors": dict(load.errors),
         "histogram": [
             {"below_ms": None if end == math.inf else round(end * 1e3, 6), "requests": number}
