@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -157,7 +158,8 @@ def test_an_area_beyond_address_65535_is_a_value_error(area: Area, start: int, s
 
 @pytest.mark.parametrize("extent", ["10", 1.5, (1, 2, 3), (1,), [1.0, 2.0], {}])
 def test_an_extent_of_another_type_is_a_type_error(extent: Wrong) -> None:
-    with pytest.raises(TypeError):
+    found = re.escape(f"size of coils is {extent!r}, allowed: an integer, or (start, size)")
+    with pytest.raises(TypeError, match=found):
         holdfast.Memory(coils=extent)
 
 
@@ -245,7 +247,18 @@ def test_a_bool_is_no_register(area: Area, memory: holdfast.Memory) -> None:
 
 @each_area
 @pytest.mark.parametrize(
-    "values", ["101", b"\x01\x00", bytearray(b"\x01"), 1, None, {1: 0}, {1, 0}, frozenset({1})]
+    "values",
+    [
+        "101",
+        b"\x01\x00",
+        bytearray(b"\x01"),
+        memoryview(b"\x01"),
+        1,
+        None,
+        {1: 0},
+        {1, 0},
+        frozenset({1}),
+    ],
 )
 def test_values_that_are_no_sequence_of_numbers_are_a_type_error(
     area: Area, values: Wrong, memory: holdfast.Memory

@@ -11,7 +11,7 @@ use holdfast_protocol::pdu::limit;
 use pyo3::exceptions::{PyIndexError, PyOSError, PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{
-    PyBool, PyByteArray, PyBytes, PyDict, PyFrozenSet, PyInt, PyList, PySet, PyString,
+    PyBool, PyByteArray, PyBytes, PyDict, PyFrozenSet, PyInt, PyList, PyMemoryView, PySet, PyString,
 };
 
 use crate::arguments::{within, word};
@@ -32,13 +32,6 @@ pyo3::create_exception!(
     PyOSError,
     "The range mirrors a device, and its values are older than allowed."
 );
-
-/// A size from address 0, or a start and a size.
-#[derive(FromPyObject)]
-enum Extent {
-    Size(Integer),
-    From(Integer, Integer),
-}
 
 #[derive(FromPyObject)]
 enum Seal {
@@ -68,10 +61,10 @@ impl Memory {
     #[new]
     #[pyo3(signature = (*, coils=None, discrete_inputs=None, holding_registers=None, input_registers=None, files=None, seal=None, name=None))]
     fn new(
-        coils: Option<Extent>,
-        discrete_inputs: Option<Extent>,
-        holding_registers: Option<Extent>,
-        input_registers: Option<Extent>,
+        coils: Option<Bound<'_, PyAny>>,
+        discrete_inputs: Option<Bound<'_, PyAny>>,
+        holding_registers: Option<Bound<'_, PyAny>>,
+        input_registers: Option<Bound<'_, PyAny>>,
         files: Option<Bound<'_, PyDict>>,
         seal: Option<Seal>,
         name: Option<&str>,
@@ -79,12 +72,9 @@ impl Memory {
         let extents = [coils, discrete_inputs, holding_registers, input_registers];
         let mut layout = Layout::default();
         for (area, extent) in Area::ALL.into_iter().zip(extents) {
-            let (start, size) = match extent {
-                None => continue,
-                Some(Extent::Size(size)) => (0, size.0),
-                Some(Extent::From(start, size)) => (start.0, size.0),
-            };
+            let Some(extent) = extent else { continue };
             let name = area.name();
+            let (start, size) = start_and_size(&name, &extent)?;
             let start = within(&format!("start of {name}"), start, 0..=65_535)? as u16;
             let size = within(&format!("size of {name}"), size, 0..=65_536)? as u32;
             let span = Span::new(start, size)
@@ -411,6 +401,19 @@ pub fn integer(value: &Bound<'_, PyAny>) -> PyResult<i128> {
     }
 }
 
+/// The extent of an area: a size from address 0, or a start and a size.
+fn start_and_size(area: &str, extent: &Bound<'_, PyAny>) -> PyResult<(i128, i128)> {
+    let found = match extent.extract::<(Integer, Integer)>() {
+        Ok((start, size)) => Ok((start.0, size.0)),
+        Err(_) => integer(extent).map(|size| (0, size)),
+    };
+    found.or_else(|_| {
+        let allowed = "an integer, or (start, size)";
+        let text = format!("size of {area} is {}, allowed: {allowed}", extent.repr()?);
+        Err(PyTypeError::new_err(text))
+    })
+}
+
 /// An argument that is an [`integer`].
 #[derive(Clone, Copy)]
 pub struct Integer(pub i128);
@@ -454,9 +457,14 @@ pub fn numbers<'py>(area: Area, values: &Bound<'py, PyAny>) -> PyResult<Vec<u16>
 
 /// Whether this is text or bytes. Both are iterable, but are not accepted as values.
 pub fn is_text(values: &Bound<'_, PyAny>) -> bool {
+    let is_view_of_bytes = || {
+        let size = values.cast::<PyMemoryView>().ok().map(|view| view.getattr("itemsize"));
+        size.is_some_and(|size| size.is_ok_and(|size| size.eq(1).unwrap_or(false)))
+    };
     values.is_instance_of::<PyString>()
         || values.is_instance_of::<PyBytes>()
         || values.is_instance_of::<PyByteArray>()
+        || is_view_of_bytes()
 }
 
 /// Whether this is a mapping, whose keys would be its values, or a set.

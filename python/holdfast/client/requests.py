@@ -216,6 +216,8 @@ def write_range(
     """
     limit = WRITE_LIMITS[area]
     address = index(address)
+    if not hasattr(items, "__len__"):
+        raise TypeError(f"values are {type(items).__name__}, not a sequence of integers")
     make = Request.write_coils if area == "coils" else Request.write_registers
     if len(items) <= limit or not split:
         if len(items) > limit:
