@@ -93,6 +93,11 @@ def test_what_is_read_can_be_written_and_gives_the_same_registers(
         (1e308, {"type": "float32", "scale": 0.001}, r"1e\+308 does not fit float32$"),
         (0.7, {"type": "bcd16"}, "0.7 is between two values of the registers"),
         ([1, None], {"type": "uint16[2]"}, "None is not a number"),
+        (3276.7, {"scale": 0.1, "null": frozenset([32767])}, r"3276\.7 stands for no value"),
+        (3276.74, {"scale": 0.1, "round": "nearest", "null": frozenset([32767])}, "for no value"),
+        (-99.9, {"type": "float32", "null": frozenset([-99.9])}, r"-99\.9 stands for no value"),
+        ("on", {"states": {7: "on"}, "null": frozenset([7])}, "7 stands for no value"),
+        ([1, 7], {"type": "uint16[2]", "null": frozenset([7])}, "7 stands for no value"),
     ],
 )
 def test_a_value_that_does_not_fit_is_refused(

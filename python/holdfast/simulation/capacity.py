@@ -31,7 +31,7 @@ def nearest(tag: Tag, value: Any) -> Any:
         if value is None:
             return 0
     if isinstance(value, str) and tag.states:
-        return tag.raw(value)
+        value = next(number for number, name in tag.states.items() if name == value)
     if not tag.is_number:
         return value
     if tag.is_float and value in _INFINITE:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from holdfast.protocol import WRITE_LIMITS
@@ -61,10 +62,10 @@ class WritableTag(ScaledTag):
     def raw(self, value: Any, *, default_round: Rounding = ROUNDING_OF_WRITES) -> Any:
         """What the registers have to hold for a value, or for the name of one.
 
-        Raises `DoesNotFit` for a value that they can't hold, and for one below `min` or above
-        `max`. `default_round` is for a tag without `round`. A number that stands for a state is
-        never rounded. Floating-point registers take the nearest number, 0 only as a measurement;
-        that of a `float16`, which can be far off, is checked again.
+        Raises `DoesNotFit` for a value that they can't hold, for one below `min` or above `max`,
+        and for a number that stands for no value. `default_round` is for a tag without `round`. A
+        number that stands for a state is never rounded. Floating-point registers take the nearest
+        number, 0 only as a measurement; that of a `float16`, which can be far off, is checked again.
         """
         if hasattr(value, "tolist"):
             value = value.tolist()
@@ -81,6 +82,12 @@ class WritableTag(ScaledTag):
             raise DoesNotFit(f"{shown(value)} is {flaw}")
         if isinstance(self.scale, RegisterScale):
             raise DoesNotFit(self.unscaled)
+        number = self._number(value, abs(self.scale), default_round)
+        if self.null and self.is_null(self._held(number)):
+            raise DoesNotFit(f"{value} stands for no value (`null` in the tag)")
+        return number
+
+    def _number(self, value: float, step: float, default_round: Rounding) -> float:
         self._check_limits(value, f"{value} is")
         if self.is_float:
             number = self._float(value)
@@ -88,7 +95,14 @@ class WritableTag(ScaledTag):
             if self.of_type.base == "float16":
                 rounded = self._linear.value(held)
                 self._check_limits(rounded, f"{value} is {rounded} in {self.of_type.element},")
-            return held if (self.round or default_round) == "nearest" else number
+            if held and default_round == "exact":
+                return number
+            # With an offset, the digits that a float has too much are no reason to refuse 0.
+            if default_round == "nearest" or math.isclose(
+                self._linear.value(0), value, rel_tol=1e-15
+            ):
+                return held
+            raise DoesNotFit(f"{value} is too small for {self.type}, which would hold 0")
         exact = self._linear.number(value)
         if exact.denominator == 1:
             return exact.numerator
@@ -96,7 +110,7 @@ class WritableTag(ScaledTag):
         rounded = self._linear.value(nearest)
         if rounded == value:
             return nearest  # A read returns this value: a float has not all digits of the scale.
-        steps = f"steps of {abs(self.scale)}"
+        steps = f"steps of {step}"
         if not self.is_stepped or (self.round or default_round) == "exact":
             other = ", or `round: nearest` in the tag" if self.is_stepped and not self.round else ""
             found = f"{value} is between two values of the registers"
@@ -114,6 +128,8 @@ class WritableTag(ScaledTag):
 
     def _held(self, number: float) -> float:
         """What the registers make of a number."""
+        if not self.is_float:
+            return number
         try:
             return nearest_float(number, self.of_type.base)
         except OverflowError:
