@@ -154,7 +154,8 @@ def test_a_dry_run_prints_the_packet_and_sends_nothing(
 
 
 @pytest.mark.parametrize(
-    "text", ["100\n200\n0x12c\n", "100,200,300", " 100; 200 ;\t300 ", "100, 200,\r\n\r\n300,\r\n"]
+    "text",
+    ["100\n200\n0x12c\n", "100,200,300", " 100; 200 ;\t300 ", "\ufeff100, 200,\r\n\r\n300,\r\n"],
 )
 def test_values_come_from_a_file_or_standard_input(text: str, tmp_path: Path) -> None:
     file = tmp_path / "values.csv"

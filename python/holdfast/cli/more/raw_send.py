@@ -19,6 +19,8 @@ from holdfast.client.url import Receiver, parse_receiver
 from holdfast.protocol import MAX_WORD
 
 FILE = click.File(encoding="utf-8")
+BYTE_ORDER_MARK = "\ufeff"
+"""Some programs begin a text with it. The encoding `utf-8-sig` would rename standard input."""
 SEPARATORS = re.compile(r"[\s,;]+")
 """Separators between values in a file."""
 
@@ -169,7 +171,7 @@ def _values(file: IO[str]) -> list[int]:
     values: list[int] = []
     try:
         for line, words in enumerate(file, 1):
-            for text in SEPARATORS.split(words.strip()):
+            for text in SEPARATORS.split(words.removeprefix(BYTE_ORDER_MARK).strip()):
                 if not text:
                     continue
                 value = whole_number(text)
