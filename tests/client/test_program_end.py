@@ -26,6 +26,19 @@ has_read.wait()
 """
 
 
+POLLED_IN_A_DAEMON_THREAD = """
+import asyncio, sys, threading, holdfast
+poller = holdfast.Poller()
+poller.add(sys.argv[1], {"x": ("holding_registers", 0)}, interval=0.01)
+has_read = threading.Event()
+async def poll():
+    async for _ in poller:
+        has_read.set()
+threading.Thread(target=lambda: asyncio.run(poll()), daemon=True).start()
+has_read.wait()
+"""
+
+
 CANCELLED = """
 import asyncio, sys, holdfast
 async def main():
@@ -50,9 +63,10 @@ def test_a_program_does_not_wait_for_a_call_that_was_cancelled(device: ScriptedD
     assert (program.returncode, stderr) == (0, b"")
 
 
-def test_a_program_ends_while_its_event_loop_reads_in_a_daemon_thread() -> None:
+@pytest.mark.parametrize("program", [IN_A_DAEMON_THREAD, POLLED_IN_A_DAEMON_THREAD])
+def test_a_program_ends_while_its_event_loop_reads_in_a_daemon_thread(program: str) -> None:
     with Stream("tcp") as device:
-        command = [sys.executable, "-c", IN_A_DAEMON_THREAD, device.url]
+        command = [sys.executable, "-c", program, device.url]
         ends = [
             subprocess.run(command, capture_output=True, timeout=wire.DEADLINE, check=False)
             for _ in range(8)

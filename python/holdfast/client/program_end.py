@@ -34,6 +34,7 @@ class Ending(Protocol):
         """Ends the thread, and what it does."""
 
 
+_ends = Event()
 _threaded: WeakSet[Ending] = WeakSet()
 _loops: WeakSet[AbstractEventLoop] = WeakSet()
 
@@ -46,6 +47,11 @@ def end_at_exit(threaded: Ending) -> None:
 def sleep_at_end(loop: AbstractEventLoop) -> None:
     """Lets a loop sleep if it still runs when the program ends."""
     _loops.add(loop)
+
+
+def has_begun() -> bool:
+    """Whether the program ends, so that executors may take nothing more."""
+    return _ends.is_set()
 
 
 def _sleep(sleeps: Event) -> None:
@@ -63,6 +69,7 @@ def _end() -> None:
 
 
 def _end_threads() -> None:
+    _ends.set()
     for threaded in list(_threaded):
         threaded.end()
 

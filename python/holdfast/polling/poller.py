@@ -270,11 +270,18 @@ class Poller:
         import asyncio  # Who iterates over it without a loop does not need it.
         from concurrent.futures import ThreadPoolExecutor
 
+        from holdfast.client import program_end
+
         if self._executor is None:
             self._executor = ThreadPoolExecutor(1, "holdfast-poller")
         while True:
             if self._pending is None or self._pending.cancelled():
-                self._pending = self._executor.submit(self.take, ABANDON_CHECK_S)
+                try:
+                    self._pending = self._executor.submit(self.take, ABANDON_CHECK_S)
+                except RuntimeError:
+                    if not program_end.has_begun():
+                        raise
+                    return  # A daemon thread runs this event loop.
             # One that runs can't be cancelled: its batch is the first of the next iteration.
             batch = await asyncio.wrap_future(self._pending)
             self._pending = None
