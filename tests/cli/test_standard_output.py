@@ -57,9 +57,33 @@ def test_tags_that_a_full_disk_leaves_unwritten_are_named(tmp_path: Path) -> Non
             text=True,
             check=False,
         )
-    told = "Not written: b, c\nholdfast: standard output: No space left on device\n"
+    told = "Written: a = 1\nNot written: b, c\nholdfast: standard output: No space left on device\n"
     assert (ended.returncode, ended.stderr) == (1, told)
     assert memory.read("holding_registers", 0, 3) == [1, 0, 0]
+
+
+@with_full
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ("hr 0 7", "Written: holding_registers 0, 1 request."),
+        ("hr 0 7 --json", "Written: holding_registers 0, 1 request."),
+        ("a=7 --tags TAGS --json", "Written: a"),
+    ],
+)
+def test_what_was_written_is_told_on_a_full_disk(tmp_path: Path, words: str, told: str) -> None:
+    tags = tmp_path / "tags.yaml"
+    tags.write_text("tags: {a: {area: holding_registers, address: 0, writable: true}}")
+    memory = holdfast.Memory(holding_registers=3)
+    with (
+        FULL.open("wb") as full,
+        holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-write") as server,
+    ):
+        command = [*HOLDFAST, "write", cli.url(server), *words.replace("TAGS", str(tags)).split()]
+        ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    full_disk = "holdfast: standard output: No space left on device"
+    assert (ended.returncode, ended.stderr.splitlines()) == (1, [told, full_disk])
+    assert memory.read("holding_registers", 0, 1) == [7]
 
 
 @with_full

@@ -195,12 +195,17 @@ def _carry_out(
             certain = {**fields, "written": fields["count"], "maybe_written": False}
             shown = certain if as_json else None
             device_errors.fail(error, url, shown, is_in_area=isinstance(job, _Job))
-    if as_json:
-        verified = {"verified": not differing} if verify else {}
-        wrong = [f"{at}: wrote {was}, read back {now}" for at, (was, now) in differing.items()]
-        print_json({"ok": not differing, **fields, **verified, **device_errors.differs(wrong)})
-    else:
-        click.echo(job.summary + ("" if not verify or differing else "; read back alike") + ".")
+    try:
+        if as_json:
+            verified = {"verified": not differing} if verify else {}
+            wrong = [f"{at}: wrote {was}, read back {now}" for at, (was, now) in differing.items()]
+            print_json({"ok": not differing, **fields, **verified, **device_errors.differs(wrong)})
+        else:
+            click.echo(job.summary + ("" if not verify or differing else "; read back alike") + ".")
+    except OSError:
+        click.echo(f"{job.summary}.", err=True)
+        raise
+    if not as_json:
         for address, (was, now) in differing.items():
             click.echo(f"holdfast: {job.where} {address}: wrote {was}, read back {now}", err=True)
     if differing:

@@ -50,9 +50,11 @@ def write_tags(
             except (ModbusError, KeyboardInterrupt) as found:
                 _fail(of, writes, at, device_errors.of_write(found), as_json)
             if not as_json:
+                done = f"Written: {_text(write)}"
                 try:
-                    click.echo(f"Written: {_text(write)}")
+                    click.echo(done)
                 except OSError:
+                    click.echo(done, err=True)
                     _print_not_written(writes[at + 1 :])
                     raise
         differing = _differing(of, client, writes, as_json) if verify else {}
@@ -61,7 +63,11 @@ def write_tags(
         names = [write.tag.name for write in writes]
         answer = {"ok": not differing, "target": of.url, "unit": of.unit, "written": names}
         wrong = [f"{name}: read back {now}" for name, now in differing.items()]
-        print_json({**answer, **verified, **device_errors.differs(wrong)})
+        try:
+            print_json({**answer, **verified, **device_errors.differs(wrong)})
+        except OSError:
+            click.echo(f"Written: {', '.join(names)}", err=True)
+            raise
     elif verify and not differing:
         click.echo("Read back alike.")
     if differing:
