@@ -137,6 +137,9 @@ def test_a_float_that_would_be_0_is_refused_unless_it_is_a_measurement() -> None
     assert encode(tag(type="float32").raw(1e-50, default_round="nearest"), "float32") == [0, 0]
     with pytest.raises(DoesNotFit, match="too small for float32"):
         encode(tag(type="float32").raw(1e-50), "float32")
+    with pytest.raises(DoesNotFit, match="too small for float64"):
+        tag(type="float64", scale=1e300).raw(1e-300)
+    assert tag(type="float16", offset=0.3).raw(0.1 + 0.2) == 0
 
 
 def test_limits_hold_for_the_rounded_value() -> None:

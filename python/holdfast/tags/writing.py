@@ -65,7 +65,7 @@ class WritableTag(ScaledTag):
         Raises `DoesNotFit` for a value that they can't hold, for one below `min` or above `max`,
         and for a number that stands for no value. `default_round` is for a tag without `round`. A
         number that stands for a state is never rounded. Floating-point registers take the nearest
-        number, 0 only as a measurement; that of a `float16`, which can be far off, is checked again.
+        number, 0 only as a measurement; that of a `float16` can be far off, and is checked again.
         """
         if hasattr(value, "tolist"):
             value = value.tolist()
