@@ -31,7 +31,7 @@ const DIFFERS: u8 = 1;
 const LOADING: u8 = 2;
 
 pub(super) struct Shared {
-    clock: Clock,
+    pub(super) clock: Clock,
     refuses_when_behind: bool,
     max_lag: Duration,
     write_timeout: Duration,

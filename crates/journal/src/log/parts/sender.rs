@@ -48,8 +48,9 @@ pub(in crate::log) struct Sender {
     /// Of the last message that was sent.
     counter: u64,
     in_flight: InFlight,
-    /// What the clock of the stream has shown at least, and when: a message was applied that it stored then.
-    stream_time: Option<(i64, Instant)>,
+    /// How far the clock of the stream is ahead of that of this machine, at least, in nanoseconds: it had
+    /// stored a message before that was applied. `None` before the first one.
+    stream_lead: Option<i64>,
     /// Why the stream has refused messages, since the last one of this node was applied.
     refusal: Option<String>,
 }
@@ -112,7 +113,7 @@ impl Sender {
             start: Start::None,
             counter: 0,
             in_flight: InFlight::default(),
-            stream_time: None,
+            stream_lead: None,
             refusal: None,
         }
     }
@@ -175,7 +176,9 @@ impl Sender {
         stored: i64,
         outcomes: Vec<Outcome>,
     ) -> Result<Option<u64>, End> {
-        self.stream_time = Some((stored, Instant::now()));
+        let lead_over = |moment: Moment| stored.saturating_sub_unsigned(moment.as_nanos());
+        // A message that arrives late says less than one before.
+        self.stream_lead = self.stream_lead.max(Some(lead_over(self.shared.now())));
         self.check_start(origin)?;
         let Some(counter) = self.own_counter(origin) else { return Ok(None) };
         self.start = Start::Applied(origin.start);
@@ -184,6 +187,8 @@ impl Sender {
         // All that the log had when it was sent comes before it, and was applied.
         if let Some(at) = sent {
             self.shared.contact(at);
+            // It was stored after it was sent. The lead was longer before the clock of the stream was set back.
+            self.stream_lead = self.stream_lead.min(Some(lead_over(at)));
         }
         Ok(Some(counter))
     }
@@ -265,10 +270,11 @@ impl Sender {
     /// When the stream may store steps at the latest that are answered at `until`, by its own clock. A cut
     /// network can deliver them later: the system goes on sending what this process has handed over.
     fn deadline(&self, until: Instant) -> i64 {
-        let (stored, at) = self.stream_time.expect("steps are taken once a message was applied");
-        // The time is short by what that message took to arrive.
-        let left = until.saturating_duration_since(at) + self.settings.write_timeout;
-        stored.saturating_add(i64::try_from(left.as_nanos()).unwrap_or(i64::MAX))
+        let lead = self.stream_lead.expect("steps are taken once a message was applied");
+        let left = until.saturating_duration_since(Instant::now()) + self.settings.write_timeout;
+        // The time is short by what the fastest message took to arrive.
+        lead.saturating_add_unsigned(self.shared.now().as_nanos())
+            .saturating_add(i64::try_from(left.as_nanos()).unwrap_or(i64::MAX))
     }
 
     fn origin(&self, counter: u64) -> Origin {
@@ -400,12 +406,27 @@ fn refusal(answer: &[u8]) -> Option<Refused> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Mutex;
+
+    use holdfast_runtime::lock;
+
     use super::*;
+    use crate::log::clock::Clock;
+
+    const SECOND: i64 = 1_000_000_000;
 
     fn sender() -> Sender {
+        timed().0
+    }
+
+    /// A sender of a machine whose clock goes on by the seconds that pass.
+    fn timed() -> (Sender, impl Fn(u64)) {
+        let time = Arc::new(Mutex::new(Duration::from_secs(1000)));
         let settings = Arc::new(Settings::new("site", "a", Vec::new()));
-        let shared = Arc::new(Shared::new(&settings));
-        Sender::new(&settings, &shared)
+        let mut shared = Shared::new(&settings);
+        shared.clock = Clock::Test(Arc::clone(&time));
+        let pass = move |seconds| *lock(&time) += Duration::from_secs(seconds);
+        (Sender::new(&settings, &Arc::new(shared)), pass)
     }
 
     fn origin(node: &str, start: u64) -> Origin {
@@ -444,14 +465,41 @@ mod tests {
 
     #[test]
     fn steps_have_as_long_again_as_their_writers_wait_by_the_clock_of_the_stream() {
-        const SECOND: i64 = 1_000_000_000;
-        let (mut sender, before) = (sender(), Instant::now());
+        let (mut sender, _) = timed();
         sender.applied(&origin("b", 1), 100 * SECOND, Vec::new()).unwrap();
-        let until = Instant::now() + Duration::from_secs(3);
+        let before = Instant::now();
+        let deadline = sender.deadline(before + Duration::from_secs(3));
         let since = i64::try_from(before.elapsed().as_nanos()).unwrap();
-        let (deadline, usual) = (sender.deadline(until), 104 * SECOND);
-        assert!((usual..=usual + since).contains(&deadline), "{deadline}");
+        let usual = 104 * SECOND;
+        assert!((usual - since..=usual).contains(&deadline), "{deadline}");
         assert_eq!(sender.deadline(before), 101 * SECOND, "their time is over");
+    }
+
+    #[test]
+    fn a_message_that_arrives_late_does_not_set_the_clock_of_the_stream_back() {
+        let (mut sender, pass) = timed();
+        let over = Instant::now();
+        sender.applied(&origin("b", 1), 100 * SECOND, Vec::new()).unwrap();
+        pass(7);
+        sender.applied(&origin("b", 1), 102 * SECOND, Vec::new()).unwrap();
+        assert_eq!(sender.deadline(over), 108 * SECOND);
+        sender.applied(&origin("b", 1), 109 * SECOND, Vec::new()).unwrap();
+        assert_eq!(sender.deadline(over), 110 * SECOND, "what was stored later says more");
+        pass(3600);
+        assert_eq!(sender.deadline(over), 3710 * SECOND, "after a suspend");
+    }
+
+    #[test]
+    fn a_clock_of_the_stream_that_was_set_back_counts_from_the_next_own_message_on() {
+        let (mut sender, pass) = timed();
+        let over = Instant::now();
+        sender.applied(&origin("b", 1), 100 * SECOND, Vec::new()).unwrap();
+        sender.ensure_start(0).unwrap();
+        sender.in_flight.push((1, Bytes::new()), Vec::new(), sender.shared.now(), over);
+        pass(2);
+        let own = origin("a", sender.start.number());
+        sender.applied(&own, 50 * SECOND, Vec::new()).unwrap();
+        assert_eq!(sender.deadline(over), 53 * SECOND);
     }
 
     #[test]
