@@ -86,10 +86,18 @@ impl InFlight {
         self.messages.front().filter(|first| first.counter == counter)?;
         let message = self.messages.pop_front()?;
         self.close(&message);
-        let refused = outcomes.iter().filter(|outcome| outcome.is_err()).count() as u64;
-        counters.refused.add_many(refused);
-        counters.steps.add_many(outcomes.len() as u64 - refused);
-        for (done, outcome) in message.steps.into_iter().zip(outcomes) {
+        // Steps that were answered before were counted then.
+        for (done, mut outcome) in message.steps.into_iter().zip(outcomes) {
+            match &mut outcome {
+                Ok(_) => counters.steps.add(),
+                Err(refused) => {
+                    counters.refused.add();
+                    // It came too late for all nodes: none carries it out.
+                    if refused.refusal == Refusal::NotConfirmed {
+                        refused.refusal = Refusal::Unavailable;
+                    }
+                }
+            }
             done(outcome);
         }
         Some(message.first_sent)
@@ -236,6 +244,21 @@ mod tests {
         assert!(two.try_recv().is_err());
         assert_eq!(in_flight.applied(1, vec![Ok(CarriedOut::default())], &counters), None);
         assert_eq!(counters.not_confirmed.get(), 1);
+    }
+
+    #[test]
+    fn a_step_that_came_too_late_for_all_nodes_is_not_unclear_to_a_writer_who_still_waits() {
+        let (mut in_flight, counters) = (InFlight::default(), Counters::default());
+        let (one, two) =
+            (push(&mut in_flight, 1, Instant::now()), push(&mut in_flight, 2, later()));
+        in_flight.expire(Instant::now(), &counters);
+        for counter in [1, 2] {
+            let late = vec![refused(Refusal::NotConfirmed)];
+            assert!(in_flight.applied(counter, late, &counters).is_some());
+        }
+        assert_eq!(one.try_recv(), Ok(refused(Refusal::NotConfirmed)));
+        assert_eq!(two.try_recv(), Ok(refused(Refusal::Unavailable)));
+        assert_eq!((counters.not_confirmed.get(), counters.refused.get()), (1, 1));
     }
 
     #[test]
