@@ -11,6 +11,7 @@ import signal
 import socket
 import threading
 from contextlib import ExitStack
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -20,6 +21,7 @@ from holdfast import _core
 from holdfast.appliance import Appliance
 from holdfast.appliance.parts.shared_logs import LogNotJoined
 from holdfast.appliance.reload import ReloadRefused
+from holdfast.cli.appliance import log_replay
 from holdfast.config import load
 from support import audits, event_streams, web, wire
 from support.brokers import NatsServer, free_port
@@ -572,6 +574,16 @@ def test_a_replay_to_before_or_behind_the_log_says_so(
     expected = f"holdfast: --to is after the last message: the log ends at sequence {last}, 2"
     assert result.stderr.startswith(expected)
     assert not invoke("log", "replay", file, "--to", str(last)).stderr
+
+
+def test_a_log_without_messages_has_no_last_one(capsys: pytest.CaptureFixture[str]) -> None:
+    empty: Any = SimpleNamespace(sequence=0, last_sequence=0, time_ns=0)
+    log_replay._check_end(empty, None, 1)
+    assert capsys.readouterr().err == (
+        "holdfast: --to is before the first message: these are the values that the log began with\n"
+    )
+    with pytest.raises(ValueError, match="--to is 1, but the log has no message yet"):
+        log_replay._check_end(empty, 1, None)
 
 
 def test_a_log_that_is_not_there_can_not_be_replayed(tmp_path: Path) -> None:

@@ -229,14 +229,18 @@ def _check_end(replaying: _core.LogReader, sequence: int | None, time_ns: int | 
     """Raises `ValueError` for a sequence that the log does not have, and notes a time beyond it."""
     when = log_lines.timestamp(replaying.time_ns / 1e9)
     end = f"the log ends at sequence {replaying.sequence}, {when}"
+    if replaying.sequence == 0:
+        end = "the log has no message yet"
     if sequence is not None and sequence > replaying.sequence:
         raise ValueError(f"--to is {sequence}, but {end}")
+    if time_ns is None:
+        return
     is_last = replaying.sequence >= replaying.last_sequence
-    if time_ns is not None and is_last and time_ns > replaying.time_ns:
-        click.echo(f"holdfast: --to is after the last message: {end}", err=True)
-    if time_ns is not None and not is_last and replaying.sequence == 0:
+    if replaying.sequence == 0:
         began = "these are the values that the log began with"
         click.echo(f"holdfast: --to is before the first message: {began}", err=True)
+    elif is_last and time_ns > replaying.time_ns:
+        click.echo(f"holdfast: --to is after the last message: {end}", err=True)
 
 
 def _tell(
