@@ -107,14 +107,26 @@ def test_a_log_is_kept_by_as_many_servers_as_wanted(
     assert not told()
     file = configuration(tmp_path, servers=urls(cluster), replicas=3)
     with Appliance(load(file)) as appliance:
-        assert told() == [{"log": "site", "replicas": 1, "configured": 3}]
+
+        def is_told() -> bool:
+            appliance.log_events(0)
+            return bool(told())
+
+        wire.until(is_told, "it is told")
+        assert told() == [{"log": "site", "replicas": "1", "configured": "3"}]
         assert appliance.replicas()["site"]["replicas"] == 1
         name = "holdfast-log-site"
         streams = [f"KV_{name}", f"OBJ_{name}", name, f"KV_{name}-leases"]
         assert done("log", "replicas", str(file)) == [f"{each}: 1 -> 3" for each in streams]
         assert done("log", "replicas", str(file)) == [f"{each}: 3" for each in streams]
+        # Each session looks.
+        used = appliance.replicas()["site"]["server"]
+        server = next(each for each in cluster if each.url.endswith(used))
+        server.kill()
+        server.start()  # It may be the only one that has all messages yet.
         wire.until(lambda: appliance.replicas()["site"]["replicas"] == 3, "the node sees it")
         write(appliance, 1, 8)
+    assert len(told()) == 1
 
 
 def failed(*arguments: object) -> str:

@@ -37,6 +37,7 @@ EVENTS = {
     "log_digests_differ": logging.ERROR,
     "log_message_ignored": logging.WARNING,
     "log_replay_failed": logging.ERROR,
+    "log_replicas_differ": logging.WARNING,
     "log_snapshot_stored": logging.DEBUG,
     "log_snapshot_failed": logging.WARNING,
     "log_snapshot_damaged": logging.WARNING,
@@ -126,8 +127,7 @@ class SharedLogs(Part):
             raise LogNotJoined(f"logs.{name}: {error}", is_permanent=is_permanent) from None
         except ValueError as error:
             raise LogNotJoined(f"logs.{name}: {error}", is_permanent=True) from None
-        status, names = log.status(), [each for each, _ in members]
-        sequence = status["sequence"]
+        sequence, names = log.status()["sequence"], [each for each, _ in members]
         # The first message is that this node has joined. Nobody else writes an embedded log.
         if sequence > 1 and settings.embedded is None:
             self.restored.update(names)
@@ -139,14 +139,6 @@ class SharedLogs(Part):
             sequence=sequence,
             memories=",".join(names),
         )
-        if status["replicas"] != settings.replicas:  # It has those with which it was made.
-            log_lines.write(
-                logging.WARNING,
-                "log_replicas_differ",
-                log=name,
-                replicas=status["replicas"],
-                configured=settings.replicas,
-            )
         self._memories.follow(name, log)
         log_servers.begin(name, settings)
 

@@ -24,6 +24,7 @@ use crate::log::parts::snapshotter::Snapshotter;
 use crate::log::parts::wrong_contents::Rejoin;
 use crate::log::settings::Settings;
 use crate::log::shared::{Checkpoint, Shared};
+use crate::log::status::Event;
 use crate::log::stream::server_lag::ServerLag;
 
 /// How often deadlines are checked.
@@ -67,6 +68,18 @@ impl Node {
         self.lag.begin_session();
         self.snapshotter.begin_session();
         self.comparer.begin_session();
+    }
+
+    /// The stream is on this many servers: it keeps those with which it was made, until an operator
+    /// changes that.
+    pub(in crate::log) fn learn_replicas(&self, found: usize) {
+        let configured = self.settings.replicas;
+        if found != configured && found != self.shared.view().replicas {
+            let (found, configured) = (found.to_string(), configured.to_string());
+            let fields = [("replicas", found.as_str()), ("configured", configured.as_str())];
+            self.shared.event(Event::new("log_replicas_differ", &fields));
+        }
+        self.shared.update(|view| view.replicas = found);
     }
 
     /// The contents are wrong: the next session loads a snapshot.

@@ -31,7 +31,7 @@ use crate::log::stream::store::{DIGEST_KEY_PREFIX, SNAPSHOT_KEY, Store, parsed};
 const MAX_FURTHER_MESSAGES: usize = 255;
 
 /// How often to look on how many servers the stream is: an operator can change it while nodes run.
-const REPLICAS_INTERVAL: Duration = Duration::from_secs(5);
+const REPLICAS_INTERVAL: Duration = Duration::from_secs(60);
 
 /// The shortest heartbeat that a consumer is asked for.
 const MIN_HEARTBEAT: Duration = Duration::from_millis(200);
@@ -99,10 +99,8 @@ impl<'n> Session<'n> {
         let (stream_end, replicas) = (info.state.last_sequence, info.config.num_replicas);
         let server = connected.server.clone();
         node.shared.event(Event::new("log_connected", &[("server", &server)]));
-        node.shared.update(|view| {
-            view.server = Some(server);
-            view.replicas = replicas;
-        });
+        node.shared.update(|view| view.server = Some(server));
+        node.learn_replicas(replicas);
         let (background, reports) = Background::new(store);
         let (now, catch_up) = (Instant::now(), CatchUp::Reading);
         let (began, last_applied) = (now, now);
@@ -118,7 +116,8 @@ impl<'n> Session<'n> {
         self.announce().await?;
         let mut checks = tokio::time::interval(CHECK_INTERVAL);
         checks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let mut replicas = tokio::time::interval(REPLICAS_INTERVAL);
+        let first = tokio::time::Instant::now() + REPLICAS_INTERVAL;
+        let mut replicas = tokio::time::interval_at(first, REPLICAS_INTERVAL);
         replicas.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             if messages.are_calm() {
@@ -313,9 +312,7 @@ impl<'n> Session<'n> {
             Report::NotStored { reason, known, found } => {
                 self.node.snapshotter.failed(&reason, known, found)?;
             }
-            Report::Replicas(Some(found)) => {
-                self.node.shared.update(|view| view.replicas = found);
-            }
+            Report::Replicas(Some(found)) => self.node.learn_replicas(found),
             // The next look does better.
             Report::Replicas(None) => {}
             Report::Freed(freed) => self.node.snapshotter.freed(freed),
