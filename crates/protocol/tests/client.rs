@@ -1232,6 +1232,46 @@ fn a_pause_separates_requests_and_does_not_count_as_waiting() {
     }
 }
 
+/// As where a thread wakes up late.
+#[test]
+fn after_a_pause_that_ends_late_requests_are_sent_late_and_have_their_whole_timeout() {
+    let tolerance = Tolerance { pause_after_connect: SECOND, ..STRICT };
+    for transport in [Transport::Tcp, Transport::Udp, Transport::RtuOverTcp, RTU] {
+        let confirmation = match transport {
+            Transport::Tcp | Transport::Udp => mbap_frame(0, 7, &[6, 0, 3, 0, 7]),
+            _ => rtu_frame(7, &[6, 0, 3, 0, 7]),
+        };
+        let mut client = Client::tolerant(transport, tolerance);
+        let ticket = client.send(WRITE);
+        client.after(60 * SECOND);
+        assert_eq!(client.got(), [], "{transport:?}: it was not sent yet");
+        assert_eq!(client.outgoing(), confirmation, "the request is the same");
+        assert_eq!(client.connection.deadline(), Some(client.now + SECOND));
+        client.after(SECOND / 2);
+        client.receive(&confirmation);
+        assert_eq!(client.got(), [(ticket, Ok(Vec::new()))], "{transport:?}");
+    }
+
+    let mut client = Client::tolerant(Transport::Tcp, tolerance);
+    let first = client.send(WRITE);
+    client.now += 60 * SECOND;
+    let second = client.send(read());
+    client.after(Duration::ZERO);
+    assert_eq!(client.got(), []);
+    assert_eq!(client.outgoing().len(), 24);
+    client.after(SECOND);
+    assert_eq!(client.got(), [first, second].map(|ticket| (ticket, Err(Failure::Timeout))));
+    assert_eq!(client.outgoing(), []);
+
+    let mut client = Client::tolerant(Transport::Udp, tolerance);
+    client.send(read());
+    client.after(60 * SECOND);
+    for _ in 0..3 {
+        assert!(!client.outgoing().is_empty(), "a read is sent three times");
+        client.after(SECOND / 3);
+    }
+}
+
 #[test]
 fn a_request_that_is_cancelled_during_a_pause_is_not_sent() {
     let tolerance = Tolerance { pause_after_connect: SECOND, ..STRICT };

@@ -199,6 +199,7 @@ impl Connection {
             return Err(why);
         }
         assert!(self.has_room(), "one request at a time");
+        self.end_pause(now);
         self.sent += 1;
         let start = now.max(self.ready_at);
         let adapted = self.flights.tolerance.adapted(request);
@@ -303,8 +304,8 @@ impl Connection {
         if self.flights.closed.is_some() {
             return;
         }
+        self.end_pause(now);
         let flights = &mut self.flights;
-        flights.held = flights.held.filter(|until| *until > now);
         let waiting = flights.len();
         match &mut self.wire {
             Wire::Stream(stream) => stream.advance(flights, now, &mut sink),
@@ -312,6 +313,17 @@ impl Connection {
             Wire::OneAtATime(line) => line.advance(flights, now, &mut sink),
         }
         self.after(waiting, now, sink);
+    }
+
+    /// Lets what waits for a pause be sent if that has ended. Where a thread wakes up late, requests are sent
+    /// late, and not given up before.
+    fn end_pause(&mut self, now: Time) {
+        if self.flights.held.take_if(|until| *until <= now).is_some() {
+            self.flights.transmitted_all(now);
+            if let Wire::Datagrams(datagrams) = &mut self.wire {
+                datagrams.transmitted(now);
+            }
+        }
     }
 
     /// Does what follows the end of a request: a pause, or the end of the connection.

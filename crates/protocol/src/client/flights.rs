@@ -239,6 +239,14 @@ impl Flights {
         flight.deadline = now + flight.timeout;
     }
 
+    /// Notes that all requests are sent now. Their timeouts begin.
+    pub(super) fn transmitted_all(&mut self, now: Time) {
+        for flight in &mut self.waiting {
+            flight.sent = now;
+            flight.deadline = now + flight.timeout;
+        }
+    }
+
     /// Starts the timeout of the first request again.
     pub(super) fn restart(&mut self, now: Time) {
         if let Some(flight) = self.waiting.front_mut() {

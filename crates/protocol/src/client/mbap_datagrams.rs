@@ -110,6 +110,16 @@ impl Datagrams {
         ticket
     }
 
+    /// Notes that the last request is sent now.
+    pub(super) fn transmitted(&mut self, now: Time) {
+        if let Some(last) = self.recent.front_mut() {
+            last.sent = now;
+        }
+        if let Some(repeat) = &mut self.repeat {
+            repeat.at = now + repeat.every;
+        }
+    }
+
     pub(super) fn deadline(&self, flights: &Flights) -> Option<Time> {
         self.repeat.map(|repeat| repeat.at).or_else(|| flights.deadline())
     }
