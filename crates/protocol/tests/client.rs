@@ -292,6 +292,22 @@ fn a_reply_that_is_read_long_after_its_timeout_is_late_however_early_it_came() {
 }
 
 #[test]
+fn a_reply_that_is_read_soon_after_its_timeout_is_not_late_because_another_one_is() {
+    let replies = [0, 1].map(|id| mbap_frame(id, 7, &[3, 2, 0, 42]));
+    for stream in [replies[1].clone(), replies.concat()] {
+        let mut client = Client::new(Transport::Tcp);
+        let first = client.send(read());
+        client.now += SECOND - SECOND / 10;
+        let second = client.send(read());
+        client.outgoing();
+        client.now += SECOND / 10 + MAX_READ_DELAY;
+        client.receive(&stream);
+        let expected = [(first, Err(Failure::Timeout)), (second, Ok(vec![0, 42]))];
+        assert_eq!(client.got(), expected);
+    }
+}
+
+#[test]
 fn a_reply_that_was_doubted_until_long_after_its_timeout_is_not_believed() {
     let reply = rtu_frame(7, &[3, 2, 0, 42]);
     for (held_up, outcome) in [(GUARD, Ok(vec![0, 42])), (2 * SECOND, Err(Failure::Timeout))] {

@@ -256,7 +256,8 @@ impl Connection {
             return;
         }
         if self.awaits_reply_until().is_some_and(|until| until + MAX_READ_DELAY <= now) {
-            self.advance(now, &mut sink);
+            // Others that have timed out since may still be answered in time.
+            self.advance_by(now - MAX_READ_DELAY, now, &mut sink);
             if self.flights.closed.is_some() {
                 return;
             }
@@ -300,7 +301,12 @@ impl Connection {
 
     /// Performs what is due: ends requests whose timeout has expired, repeats a datagram, or sends
     /// a queued request.
-    pub fn advance(&mut self, now: Time, mut sink: impl FnMut(Done<'_>)) {
+    pub fn advance(&mut self, now: Time, sink: impl FnMut(Done<'_>)) {
+        self.advance_by(now, now, sink);
+    }
+
+    /// Does the same, but gives up requests of many in flight only if they were `due` by then.
+    fn advance_by(&mut self, due: Time, now: Time, mut sink: impl FnMut(Done<'_>)) {
         if self.flights.closed.is_some() {
             return;
         }
@@ -308,7 +314,7 @@ impl Connection {
         let flights = &mut self.flights;
         let waiting = flights.len();
         match &mut self.wire {
-            Wire::Stream(stream) => stream.advance(flights, now, &mut sink),
+            Wire::Stream(stream) => stream.advance(flights, due, now, &mut sink),
             Wire::Datagrams(datagrams) => datagrams.advance(flights, now, &mut sink),
             Wire::OneAtATime(line) => line.advance(flights, now, &mut sink),
         }

@@ -238,14 +238,16 @@ impl Stream {
         }
     }
 
+    /// Ends requests whose timeouts had expired when it was `due`.
     pub(super) fn advance(
         &mut self,
         flights: &mut Flights,
+        due: Time,
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
         let mut timed_out = false;
-        while let Some(flight) = flights.expired(now) {
+        while let Some(flight) = flights.expired(due) {
             timed_out = true;
             self.given_up.insert(flight.transaction_id, GivenUp::new(&flight));
             self.count_timeout(flight.sent, now);
