@@ -292,6 +292,33 @@ fn a_reply_that_is_read_long_after_its_timeout_is_late_however_early_it_came() {
 }
 
 #[test]
+fn stops_of_the_process_raise_no_timeout() {
+    for transport in [Transport::Tcp, Transport::Udp, RTU] {
+        let mut client = Client::new(transport);
+        for id in 0..4u16 {
+            client.send(read());
+            while client.outgoing().is_empty() {
+                let wait = client.connection.deadline().unwrap() - client.now;
+                client.after(wait);
+            }
+            // Before a timer, or after it.
+            client.now += SECOND + MAX_READ_DELAY;
+            if id % 2 == 0 {
+                client.after(Duration::ZERO);
+            }
+            client.receive(&match transport {
+                RTU => rtu_frame(7, &[3, 2, 0, 42]),
+                _ => mbap_frame(id, 7, &[3, 2, 0, 42]),
+            });
+            assert!(client.got().iter().all(|(_, got)| *got == Err(Failure::Timeout)));
+        }
+        assert_eq!(client.connection.late(), 4, "{transport:?}");
+        assert_eq!(client.connection.longest_late(), Duration::ZERO, "nobody knows");
+        assert_eq!(client.connection.take_raised(), 0, "{transport:?}");
+    }
+}
+
+#[test]
 fn a_reply_that_is_read_soon_after_its_timeout_is_not_late_because_another_one_is() {
     let replies = [0, 1].map(|id| mbap_frame(id, 7, &[3, 2, 0, 42]));
     for stream in [replies[1].clone(), replies.concat()] {

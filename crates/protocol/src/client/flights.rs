@@ -4,7 +4,7 @@ use alloc::collections::VecDeque;
 use alloc::vec::Vec;
 use core::time::Duration;
 
-use super::{Attempt, Closed, Failure, InvalidResponse, Time, Tolerance};
+use super::{Attempt, Closed, Failure, InvalidResponse, MAX_READ_DELAY, Time, Tolerance};
 use crate::frame::rtu;
 use crate::pdu::{EncodedRequest, Response, ResponseError};
 
@@ -69,6 +69,11 @@ impl Flight {
     /// From when on the device can have handled it: since it was sent, and since the reply before.
     pub(super) fn began(&self) -> Time {
         self.deadline.saturating_sub(self.timeout)
+    }
+
+    /// Whether its reply may have come in time, and waits to be read: the process may have been stopped.
+    pub(super) fn may_be_unread(&self, now: Time) -> bool {
+        self.deadline + MAX_READ_DELAY <= now
     }
 }
 

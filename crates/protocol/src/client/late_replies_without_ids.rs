@@ -107,12 +107,16 @@ pub(super) struct Unanswered {
     until: Time,
     /// What comes before is a copy of the reply to another attempt of the same call.
     from: Time,
+    /// Its reply may have waited to be read: the time until then says nothing of the unit.
+    is_unread: bool,
 }
 
 /// Why a request ended without its reply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Ended {
     TimedOut,
+    /// Long after its timeout: its reply may have come in time, and waits to be read.
+    Unread,
     WithConnection,
     /// By a reply that is not its own, or by an exception that a gateway sent in its place.
     Other,
@@ -242,7 +246,7 @@ impl LateReplies {
         let usual = longest.map(|longest| (longest * 4).max(GUARD));
         let longest_timeout = self.lateness.note_timeout(unit_id, timeout);
         match how {
-            Ended::TimedOut => {
+            Ended::TimedOut | Ended::Unread => {
                 let latest = self.lateness.latest(unit_id) * 2;
                 let by_others = (longest_timeout * LATENESS_FACTOR).min(MAX_LATENESS_BY_OTHERS);
                 let known = usual.unwrap_or(GUARD).max(latest).max(by_others).max(MIN_LATENESS);
@@ -310,8 +314,15 @@ impl LateReplies {
             self.unanswered.remove(oldest.unwrap_or_default());
         }
         let request = request.clone();
-        let from = Time::ZERO;
-        self.unanswered.push_back(Unanswered { unit_id, request, is_broadcast, sent, until, from });
+        self.unanswered.push_back(Unanswered {
+            unit_id,
+            request,
+            is_broadcast,
+            sent,
+            until,
+            from: Time::ZERO,
+            is_unread: how == Ended::Unread,
+        });
     }
 
     /// The longest time of a reply of this unit that was not late.
@@ -324,8 +335,8 @@ impl LateReplies {
         self.unanswered.iter()
     }
 
-    /// Notes the late reply to the request at this place. Returns how long it took; 0 if others may
-    /// follow: copies of it, or the confirmations of a broadcast by other units.
+    /// Notes the late reply to the request at this place. Returns how long it took; 0 if it may have waited to
+    /// be read, or if others may follow: copies of it, or the confirmations of a broadcast by other units.
     pub(super) fn late(&mut self, place: usize, now: Time) -> Duration {
         self.has_late = true;
         let may_repeat = |earlier: &Unanswered| {
@@ -336,6 +347,9 @@ impl LateReplies {
         }
         let Some(earlier) = self.unanswered.remove(place) else { return Duration::ZERO };
         self.guard.has_begun = true;
+        if earlier.is_unread {
+            return Duration::ZERO;
+        }
         let took = now.saturating_sub(earlier.sent).min(earlier.until - earlier.sent);
         self.lateness.late(earlier.unit_id, took);
         took

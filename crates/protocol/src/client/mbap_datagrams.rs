@@ -37,12 +37,11 @@ pub(super) struct Datagrams {
 struct Recent {
     transaction_id: u16,
     unit_id: u8,
-    sent: Time,
+    /// `None` once the time until a reply is read says nothing of the unit: one has come, or may have waited.
+    sent: Option<Time>,
     within: Duration,
     /// How many replies to it may still come.
     left: u32,
-    /// Whether one of them has come.
-    is_answered: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -77,14 +76,14 @@ impl Datagrams {
         let recent = self.recent.iter_mut().find(|recent| recent.transaction_id == id)?;
         recent.left = recent.left.checked_sub(1)?;
         let found = *recent;
-        recent.is_answered = true;
+        recent.sent = None;
         Some(found)
     }
 
     /// Notes a late reply.
     fn late(&mut self, flights: &mut Flights, request: Recent, now: Time) {
-        let Recent { unit_id, sent, within, is_answered, .. } = request;
-        let took = if is_answered { Duration::ZERO } else { now.saturating_sub(sent) };
+        let Recent { unit_id, sent, within, .. } = request;
+        let took = sent.map_or(Duration::ZERO, |sent| now.saturating_sub(sent));
         let took = took.min(within * MAX_RAISED_FACTOR);
         flights.came_late(took);
         if took > within {
@@ -99,9 +98,8 @@ impl Datagrams {
         let left = if call.request.is_read() { UDP_ATTEMPTS - 1 } else { 0 };
         self.repeat = (left > 0).then_some(Repeat { at: now + every, every, left });
         self.recent.truncate(MAX_RECENT_REQUESTS - 1);
-        let (left, is_answered) = (left + 1, false);
-        let sent = now;
-        let recent = Recent { transaction_id: id, unit_id, sent, within, left, is_answered };
+        let (sent, left) = (Some(now), left + 1);
+        let recent = Recent { transaction_id: id, unit_id, sent, within, left };
         self.recent.push_front(recent);
         self.next_id = self.following(id);
         let ticket = flights.push(call, id, now);
@@ -113,7 +111,7 @@ impl Datagrams {
     /// Notes that the last request is sent now.
     pub(super) fn transmitted(&mut self, now: Time) {
         if let Some(last) = self.recent.front_mut() {
-            last.sent = now;
+            last.sent = Some(now);
         }
         if let Some(repeat) = &mut self.repeat {
             repeat.at = now + repeat.every;
@@ -138,7 +136,9 @@ impl Datagrams {
                 let is_expected = in_flight
                     && flights.first().is_some_and(|one| accept_unit.accepts(one.unit_id, unit_id));
                 if is_expected {
-                    if let Some(Recent { unit_id, sent, within, .. }) = self.take(transaction_id) {
+                    if let Some(Recent { unit_id, sent: Some(sent), within, .. }) =
+                        self.take(transaction_id)
+                    {
                         self.lateness.answered(unit_id, now.saturating_sub(sent), within);
                     }
                     (self.repeat, self.strays) = (None, 0);
@@ -171,6 +171,9 @@ impl Datagrams {
     ) {
         if let Some(flight) = flights.expired(now) {
             self.repeat = None;
+            if let Some(last) = self.recent.front_mut().filter(|_| flight.may_be_unread(now)) {
+                last.sent = None;
+            }
             return flights.end(flight, Err(Failure::Timeout), sink);
         }
         if let Some(Repeat { at, every, left }) = self.repeat

@@ -41,14 +41,16 @@ pub(super) struct Stream {
 struct GivenUp {
     ticket: Ticket,
     unit_id: u8,
-    began: Time,
+    /// `None` if its reply may have waited to be read: the time until then says nothing of the unit.
+    began: Option<Time>,
     within: Duration,
 }
 
 impl GivenUp {
-    fn new(flight: &Flight) -> Option<GivenUp> {
+    fn new(flight: &Flight, may_be_unread: bool) -> Option<GivenUp> {
         let Flight { ticket, unit_id, within, .. } = *flight;
-        Some(GivenUp { ticket, unit_id, began: flight.began(), within })
+        let began = (!may_be_unread).then(|| flight.began());
+        Some(GivenUp { ticket, unit_id, began, within })
     }
 }
 
@@ -109,7 +111,7 @@ impl Stream {
         let behind: usize = flights.after(ticket).map(frame_len).sum();
         let Some(flight) = flights.take(ticket) else { return };
         if flights.held.is_none() {
-            self.given_up.insert(flight.transaction_id, GivenUp::new(&flight));
+            self.given_up.insert(flight.transaction_id, GivenUp::new(&flight, false));
             // Requests in flight at the same time count as one: the first deadline is enough.
             let next = (flight.deadline, flight.sent);
             self.cut_short = Some(self.cut_short.map_or(next, |first| first.min(next)));
@@ -226,12 +228,13 @@ impl Stream {
             return flights.came_late(Duration::ZERO);
         };
         // The owner of the socket may not have read for a while.
-        let took = now.saturating_sub(began).min(within * MAX_RAISED_FACTOR);
+        let took = began.map_or(Duration::ZERO, |began| now.saturating_sub(began));
+        let took = took.min(within * MAX_RAISED_FACTOR);
         flights.came_late(took);
         flights.restart_after(ticket, now);
         // A device that handles one request at a time can't have begun those after it before.
         let after = self.given_up.values_mut().flatten().filter(|other| other.ticket > ticket);
-        after.for_each(|other| other.began = now);
+        after.for_each(|other| other.began = other.began.map(|_| now));
         // A call that its caller has ended before its timeout says nothing of the unit.
         if took > within {
             self.lateness.late(unit_id, took);
@@ -249,7 +252,8 @@ impl Stream {
         let mut timed_out = false;
         while let Some(flight) = flights.expired(due) {
             timed_out = true;
-            self.given_up.insert(flight.transaction_id, GivenUp::new(&flight));
+            let given_up = GivenUp::new(&flight, flight.may_be_unread(now));
+            self.given_up.insert(flight.transaction_id, given_up);
             self.count_timeout(flight.sent, now);
             flights.end(flight, Err(Failure::Timeout), sink);
         }

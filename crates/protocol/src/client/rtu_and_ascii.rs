@@ -640,9 +640,10 @@ impl OneAtATime {
         }
         // First of all: where a thread wakes up late, its request is sent late, and not given up unsent.
         self.transmit(flights, now);
-        if let Some(deadline) = flights.deadline().filter(|deadline| *deadline <= now) {
+        if let Some(flight) = flights.first().filter(|flight| flight.deadline <= now) {
+            let how = if flight.may_be_unread(now) { Ended::Unread } else { Ended::TimedOut };
             // Where this is called late, its reply may have come before, and is read only now.
-            self.note_ended(flights, Ended::TimedOut, deadline);
+            self.note_ended(flights, how, flight.deadline);
         }
         if let Some(flight) = flights.expired(now) {
             let sent = !matches!(self.state, State::Quieting { .. });
