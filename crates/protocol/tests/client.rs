@@ -752,6 +752,27 @@ fn on_a_serial_line_that_is_never_silent_a_request_ends_unsent_and_says_so() {
 }
 
 #[test]
+fn a_repeated_request_that_finds_no_silence_has_timed_out() {
+    let mut client = Client::tolerant(RTU, Tolerance { retries: 1, ..STRICT });
+    client.send(read());
+    client.outgoing();
+    client.after(SECOND);
+    let again = client.again.take().unwrap();
+    client.got();
+    client.receive(&[0]);
+    let request = EncodedRequest::new(&read());
+    let ticket = client.connection.send_again(7, &request, SECOND, again, client.now).unwrap();
+    let mut got = Vec::new();
+    while got.is_empty() {
+        client.receive(&[0]);
+        client.after(SILENCE / 2);
+        assert_eq!(client.outgoing(), []);
+        got = client.got();
+    }
+    assert_eq!(got, [(ticket, Err(Failure::Timeout))], "the first one was sent");
+}
+
+#[test]
 fn a_request_whose_thread_wakes_up_late_is_sent_and_has_its_whole_timeout() {
     for transport in [RTU, ASCII] {
         let mut client = Client::new(transport);

@@ -651,7 +651,8 @@ impl OneAtATime {
             let invalid = self.stray.map(InvalidResponse::Frame);
             let failure = match invalid {
                 Some(invalid) => Failure::Invalid(invalid),
-                None if sent => Failure::Timeout,
+                // An earlier attempt was sent, and got no reply.
+                None if sent || self.repeats => Failure::Timeout,
                 None => Failure::NoSilence,
             };
             flights.end(flight, Err(failure), sink);
