@@ -484,6 +484,57 @@ def test_the_right_to_write_is_that_after_a_reload(opened: Opened, noticed: str)
     expect(view.button("Write 0")).to_have_count(0)
 
 
+@pytest.mark.parametrize("noticed", ["by a write", "by a watch"])
+def test_a_change_of_rights_keeps_plots_and_values(
+    opened: Opened, plant: holdfast.Memory, noticed: str
+) -> None:
+    def status(route: Route) -> None:
+        route.fulfill(json={**route.fetch().json(), "writes": False})
+
+    plant.write("holding_registers", 4, [4711])
+    view = opened()
+    view.connect()
+    view.says("The device responded")
+    view.choose(address="4", quantity="1", type="uint16", interval="50")
+    view.button("Add range to view").click()
+    view.choose(area="1", address="0", quantity="1")
+    view.button("Add range to view").click()
+    view.button("Read").click()
+    expect(view.page.get_by_title("Write coils 0")).to_be_visible()
+    if noticed == "by a watch":
+        register = {"kind": "range", "values": [4711], "texts": ["4711"], "errors": {}}
+        coil = {"kind": "range", "values": [True], "texts": ["true"], "errors": {}}
+        body = json.dumps({"time": 0, "rtt": 0, "stream": True, "parts": [register, coil]})
+        ended = {"content_type": "text/event-stream", "body": f"event: view\ndata: {body}\n\n"}
+        view.page.route("**/api/gateway", status)
+        view.page.route("**/watch/view", lambda route: route.fulfill(**ended), times=1)
+    view.button("Plot 4").click()
+    expect(view.button("Remove the plot of hr 4")).to_be_visible()
+    if noticed == "by a write":
+        said = {"success": False, "error": "writes are disabled"}
+        refused = {"status": 403, "headers": {"Holdfast-Reason": "writes_off"}, "json": said}
+        view.page.route("**/api/gateway", status)
+        view.page.route("**/write/register", lambda route: route.fulfill(**refused))
+        review(view, "Write 4", "7")
+        view.button("Write it").click()
+        view.says("Not written.")
+        view.button("Cancel").click()
+    view.says("reads only")
+    expect(view.button("Write 4")).to_have_count(0)
+    view.says("Writes are disabled. Enable")
+    plant.write("holding_registers", 4, [1234])
+    plot = view.page.get_by_role("article").filter(has_text="hr 4")
+    expect(plot.get_by_role("status")).to_have_text("1234")
+    with view.page.expect_download() as found:
+        view.button("Download plots as CSV").click()
+    text = found.value.path().read_text()
+    assert "hr 4,4711" in text
+    assert "hr 4,1234" in text
+    expect(view.page.get_by_title("Plot coils 0")).to_be_visible()
+    view.button("Coil 0: 1, on").click()
+    expect(view.page.get_by_role("dialog")).to_be_hidden()
+
+
 def test_a_token_is_asked_for_and_kept_in_the_tab_only(opened: Opened) -> None:
     view = opened(tokens=(("edge", hashlib.sha256(SECRET.encode()).digest()),))
     box = view.page.get_by_label("Token", exact=True)

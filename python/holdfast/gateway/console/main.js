@@ -38,6 +38,7 @@ let connecting = null;
 async function inquire() {
   const status = await get("/api/gateway");
   may.write = status.writes;
+  values.permit();
   const mode = $("mode");
   mode.textContent = status.writes ? "reads and writes" : "reads only";
   mode.classList.toggle("writes", status.writes);

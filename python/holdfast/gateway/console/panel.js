@@ -29,6 +29,11 @@ export class Panel {
     this.place.append(root);
   }
 
+  /** Shows what is for writing, or hides it. */
+  permit(writes) {
+    for (const each of this.root.querySelectorAll(".write")) each.hidden = !writes;
+  }
+
   /** Sets all values. With `mark`, changes are marked. */
   set({ values, texts, errors }, mark) {
     const all = (list) => list.map((each, index) => [index, each]);

@@ -11,7 +11,7 @@ const SHORT = ["coil", "di", "hr", "ir"];
 
 /** Shows the values of a range. Its cells have the numbers of the addresses. */
 export class Table extends Panel {
-  /** `actions` has `write(address)`, or null if writes are not possible, and `plot(address)`. */
+  /** `actions` has `write(address)`, or null if the area can't be written, and `plot(address)`. */
   constructor(part, actions) {
     super(part);
     this.actions = actions;
@@ -135,13 +135,13 @@ export class Table extends Panel {
 
   buttons(at) {
     const address = this.part.address + at;
-    const button = (text, label, onclick) =>
-      h("button", { class: "quiet", type: "button", "aria-label": `${label} ${address}`, onclick }, text);
+    const button = (text, label, onclick, kind = "") =>
+      h("button", { class: `quiet ${kind}`, type: "button", "aria-label": `${label} ${address}`, onclick }, text);
     const { write, plot } = this.actions;
     return h("td", { role: "cell", class: "do" },
       button("Types", "All types from", () => this.showTypes(at)),
       button("Plot", "Plot", () => plot(address)),
-      write ? button("Write", "Write", () => write(address)) : null);
+      write ? button("Write", "Write", () => write(address), "write") : null);
   }
 
   bits() {
@@ -156,12 +156,22 @@ export class Table extends Panel {
   }
 
   bit(at) {
-    const address = this.part.address + at;
-    const { write, plot } = this.actions;
-    const title = `${write ? "Write" : "Plot"} ${areaOf(this.part.area).title.toLowerCase()} ${address}`;
-    const bit = h("button", { class: "bit", type: "button", title, onclick: () => (write ?? plot)(address) });
+    const bit = h("button", { class: "bit", type: "button" });
     this.shown.set(at, { bit });
     return bit;
+  }
+
+  /** A click on a bit writes it. It is for a plot if it can't be written. */
+  permit(writes) {
+    super.permit(writes);
+    if (!this.part.ofBits) return;
+    const { write, plot } = this.actions;
+    const [verb, act] = writes && write ? ["Write", write] : ["Plot", plot];
+    for (const [at, { bit }] of this.shown) {
+      const address = this.part.address + at;
+      bit.title = `${verb} ${areaOf(this.part.area).title.toLowerCase()} ${address}`;
+      bit.onclick = () => act(address);
+    }
   }
 
   /** Shows up to four registers in every type and byte order. */

@@ -6,7 +6,7 @@ import { functionOf, placed } from "./parts.js";
 
 /** Shows tags with their values and units. The cells of a list have the names of its tags. */
 export class TagTable extends Panel {
-  /** `actions` has `write(name)`, or null if the gateway does not write, and `plot(name)`. */
+  /** `actions` has `write(name)` and `plot(name)`. */
   constructor(part, tags, actions) {
     super(part);
     this.tags = tags;
@@ -27,8 +27,8 @@ export class TagTable extends Panel {
   row(tag) {
     const value = h("td", { role: "cell", class: "typed" });
     this.rows.push(value);
-    const button = (text, onclick) =>
-      h("button", { class: "quiet", type: "button", "aria-label": `${text} ${tag.name}`, onclick }, text);
+    const button = (text, onclick, kind = "") =>
+      h("button", { class: `quiet ${kind}`, type: "button", "aria-label": `${text} ${tag.name}`, onclick }, text);
     const { write, plot } = this.actions;
     const flaw = !tag.writable ? "writable is not true in the tag list" : typeof tag.scale !== "number" ? "its scale is in a register" : null;
     return h("tr", { role: "row", "data-tag": tag.name },
@@ -38,8 +38,7 @@ export class TagTable extends Panel {
       h("td", { role: "cell", class: "place" }, placed(tag)),
       h("td", { role: "cell", class: "do" },
         isPlotted(tag) ? button("Plot", () => plot(tag.name)) : null,
-        write && flaw === null ? button("Write", () => write(tag.name)) : null,
-        write && flaw !== null ? h("span", { class: "dim", title: flaw }, "read only") : null));
+        flaw === null ? button("Write", () => write(tag.name), "write") : h("span", { class: "dim write", title: flaw }, "read only")));
   }
 
   render(index, mark) {

@@ -264,18 +264,23 @@ export class Values {
   show(wanted, data) {
     this.plots?.end();
     this.plots = null;
-    this.offers = this.may.write;
     this.panels = wanted.map((each, at) => this.panel(each, data.parts[at].tags ?? this.panels[at]?.tags));
     $("table").replaceChildren(...this.panels.map((panel) => panel.place));
     if (wanted.length > 1) this.panels.forEach((panel) => (panel.heading.hidden = false));
     this.wholes = wanted;
-    $("only-reads").hidden = this.may.write !== false;
     $("save").hidden = false;
+    this.permit();
+  }
+
+  /** Offers writes if the gateway allows them now. Nothing else of the tables changes, nor do the plots. */
+  permit() {
+    this.panels.forEach((panel) => panel.permit(this.may.write === true));
+    $("only-reads").hidden = this.may.write !== false;
   }
 
   panel(whole, tags) {
     const part = { ...whole, device: this.device };
-    const writes = this.may.write && (part.kind === "tags" || part.area === 1 || part.area === 3);
+    const writes = part.kind === "tags" || part.area === 1 || part.area === 3;
     const actions = {
       write: writes ? (cell) => this.write(panel, cell) : null,
       plot: (cell) => this.plot(panel, cell),
@@ -401,9 +406,9 @@ export class Values {
     if (first) this.plotted?.forEach((key) => this.plots.choose(key));
   }
 
-  /** Returns whether the tables have the tags of an event, and offer writes if the gateway allows them. */
+  /** Returns whether the tables have the tags of an event. */
   fits(data) {
-    return this.offers === this.may.write && data.parts.every((each, at) => !each.tags || parts.same(each.tags, this.panels[at].tags));
+    return data.parts.every((each, at) => !each.tags || parts.same(each.tags, this.panels[at].tags));
   }
 
   /** Takes the values of an event. */
