@@ -966,10 +966,17 @@ def test_a_second_click_or_key_confirms_nothing_unseen(opened: Opened, new: str)
             view.says("The current values have changed.")
         expect(view.button("Write it")).to_be_focused()
         expect(view.button("Write it")).to_be_disabled()
+        told = view.page.locator("#write-wait").text_content()
+        sent = len(view.requests)
         view.page.keyboard.press("Enter")
         view.button("Write it").click(force=True)
+        # A confirmed write tells at once that it reads.
+        assert view.page.locator("#write-wait").text_content() == told
         view.button("Back").click()
         view.button("Cancel").click()
+        later = view.requests[sent:]
+        # An open review is read again and again.
+        assert later == [] or (refreshed != NEVER and not any("/write/" in url for url in later))
         assert device.writes == []
 
 
