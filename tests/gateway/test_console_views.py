@@ -663,6 +663,8 @@ def test_a_damaged_link_is_told(opened: Opened) -> None:
         ("type=int", "type is “int”"),
         ("quantity=-5", "quantity is “-5”"),
         ("address=4OO", "address is “4OO”"),
+        ("part=4,1000,2,uint16,ABCD&interval=abc", "interval is “abc”"),
+        ("part=4,1000,2,constructor,ABCD", "“4,1000,2,constructor,ABCD” is not a range"),
     ],
 )
 def test_what_is_left_of_a_damaged_link_is_not_watched(
@@ -678,7 +680,7 @@ def test_what_is_left_of_a_damaged_link_is_not_watched(
     view.says(f"A part of the link can't be used: {says}")
     expect(view.button("Watch")).to_have_attribute("aria-pressed", "false")
     assert not [url for url in view.requests if url.endswith("/watch/view")]
-    view.choose(area="4", address="1000", quantity="2", type="uint16")
+    view.choose(area="4", address="1000", quantity="2", type="uint16", interval="100")
     view.button("Watch").click()
     view.says("Watching ")
     expect(view.page).not_to_have_url(re.compile("plot="))

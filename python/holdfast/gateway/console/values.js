@@ -85,8 +85,10 @@ export class Values {
         found.push(error.message);
       }
     }
-    if (view.parts.length === 0) {
-      for (const [id, value] of view.range) if ($(id).value !== value || !$(id).checkValidity()) found.push(`${id} is “${value}”`);
+    // With parts, the range is not used, but the interval is.
+    for (const [id, value] of view.range) {
+      const isUsed = id === "interval" || view.parts.length === 0;
+      if (isUsed && ($(id).value !== value || !$(id).checkValidity())) found.push(`${id} is “${value}”`);
     }
     this.flaws = found.map((each) => `A part of the link can't be used: ${each}. Nothing is watched by itself.`);
     this.chips();
