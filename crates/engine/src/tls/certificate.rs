@@ -4,9 +4,14 @@ use rustls::pki_types::{CertificateDer, UnixTime};
 use rustls::{CertificateError, ExtendedKeyPurpose};
 use webpki::KeyPurposeId;
 use x509_cert::certificate::{CertificateInner, Profile};
-use x509_cert::der::asn1::{AnyRef, BitString, ObjectIdentifier, UintRef, Utf8StringRef};
+use x509_cert::der::asn1::{
+    AnyRef, BitString, ObjectIdentifier, OctetString, UintRef, Utf8StringRef,
+};
 use x509_cert::der::{self, Decode, Encode, Reader, SliceReader};
-use x509_cert::ext::pkix::{BasicConstraints, CrlDistributionPoints, ExtendedKeyUsage, KeyUsage};
+use x509_cert::ext::pkix::{
+    AuthorityKeyIdentifier, BasicConstraints, CrlDistributionPoints, ExtendedKeyUsage, KeyUsage,
+    SubjectKeyIdentifier,
+};
 use x509_cert::name::Name;
 use x509_cert::serial_number::SerialNumber;
 use x509_cert::spki::{AlgorithmIdentifierOwned, SubjectPublicKeyInfoOwned};
@@ -232,6 +237,18 @@ impl Parsed {
 
     pub(super) fn key(&self) -> &SubjectPublicKeyInfoOwned {
         self.0.tbs_certificate().subject_public_key_info()
+    }
+
+    /// What it calls its key.
+    pub(super) fn own_key(&self) -> Option<OctetString> {
+        let found = self.0.tbs_certificate().get_extension::<SubjectKeyIdentifier>();
+        found.ok().flatten().map(|(_, id)| id.0)
+    }
+
+    /// What it calls the key of its authority.
+    pub(super) fn authority_key(&self) -> Option<OctetString> {
+        let found = self.0.tbs_certificate().get_extension::<AuthorityKeyIdentifier>();
+        found.ok().flatten()?.1.key_identifier
     }
 
     fn key_algorithm(&self) -> Option<Vec<u8>> {

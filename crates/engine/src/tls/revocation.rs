@@ -14,20 +14,20 @@ use x509_cert::crl::{CertificateList, TbsCertList};
 use x509_cert::der::asn1::{ContextSpecific, ObjectIdentifier, OctetString, Uint};
 use x509_cert::der::{self, Decode, Encode, Reader, SliceReader, TagNumber};
 use x509_cert::ext::Extension;
-use x509_cert::ext::pkix::IssuingDistributionPoint;
 use x509_cert::ext::pkix::name::{DistributionPointName, GeneralName};
+use x509_cert::ext::pkix::{AuthorityKeyIdentifier, IssuingDistributionPoint};
 use x509_cert::name::Name;
 use x509_cert::time::Time;
 
 use super::certificate::{AnySerial, Parsed};
 use super::files::FileError;
 use super::server_files::ExpiredLists;
+use super::verification::Listed;
 
 /// The extensions that RFC 5280, 5.2 requires of every list. No judgement depends on them.
-const REQUIRED: [(ObjectIdentifier, &str); 2] = [
-    (ObjectIdentifier::new_unwrap("2.5.29.35"), "authority key identifier"),
-    (CRL_NUMBER, "CRL number"),
-];
+const REQUIRED: [(ObjectIdentifier, &str); 2] =
+    [(AUTHORITY_KEY, "authority key identifier"), (CRL_NUMBER, "CRL number")];
+const AUTHORITY_KEY: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.35");
 const CRL_NUMBER: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.20");
 
 /// A revocation list.
@@ -107,6 +107,12 @@ impl List {
         Uint::from_der(self.extension(CRL_NUMBER)?.extn_value.as_bytes()).ok()
     }
 
+    /// What it calls the key of its authority.
+    fn authority_key(&self) -> Option<OctetString> {
+        let found = self.extension(AUTHORITY_KEY)?.extn_value.as_bytes();
+        AuthorityKeyIdentifier::from_der(found).ok()?.key_identifier
+    }
+
     /// The required extensions that it lacks, in words.
     pub(super) fn missing(&self) -> Vec<&'static str> {
         let lacks = |(id, _): &(ObjectIdentifier, _)| self.extension(*id).is_none();
@@ -122,6 +128,25 @@ impl List {
     pub(super) fn is_signed_by(&self, authority: &Parsed) -> bool {
         let CertificateList { signature_algorithm, signature, .. } = &self.parsed;
         authority.has_signed(&self.signed, signature_algorithm, signature)
+    }
+
+    /// Whether a list that an issuer has not signed is provably of another authority of the same name:
+    /// it names another key, or another listed authority has signed it. Otherwise it may be a damaged
+    /// one of the issuer, or have an unsupported signature.
+    pub(super) fn is_of_another(
+        &self,
+        issuer_key: Option<&OctetString>,
+        others: &[Listed],
+    ) -> bool {
+        let names_another = match (self.authority_key(), issuer_key) {
+            (Some(named), Some(key)) => named != *key,
+            _ => false,
+        };
+        let has_signed = |each: &Listed| {
+            let parsed = &each.parsed;
+            each.is_authority() && parsed.has_subject(self.issuer()) && self.is_signed_by(parsed)
+        };
+        names_another || others.iter().any(has_signed)
     }
 
     /// Whether the list is for a certificate: it has the same issuer, and the certificate is within its
@@ -174,14 +199,15 @@ pub(super) struct Lists {
 }
 
 impl Lists {
-    /// Judges every certificate of a path to a listed authority.
+    /// Judges every certificate of a path to an authority, one of those `listed`.
     ///
     /// # Errors
     /// One is revoked, or no list tells that it is not.
     pub(super) fn judge(
         &self,
         path: &VerifiedPath<'_>,
-        listed: &Parsed,
+        authority: &Parsed,
+        listed: &[Listed],
         now: UnixTime,
     ) -> Result<(), webpki::Error> {
         if self.lists.is_empty() {
@@ -191,27 +217,29 @@ impl Lists {
         let mut presented = None;
         for each in path.intermediate_certificates().rev() {
             let own = parsed(each)?;
-            let list = self.find_list(each, &own, false, presented.as_ref().unwrap_or(listed))?;
+            let issuer = presented.as_ref().unwrap_or(authority);
+            let list = self.find_list(each, &own, false, issuer, listed)?;
             self.check_certificate(each, list, presented.as_ref(), now)?;
             presented = Some(own);
         }
         let end_entity: &Cert<'_> = path.end_entity();
-        let issuer = presented.as_ref().unwrap_or(listed);
-        let list = self.find_list(end_entity, &parsed(end_entity)?, true, issuer)?;
+        let issuer = presented.as_ref().unwrap_or(authority);
+        let list = self.find_list(end_entity, &parsed(end_entity)?, true, issuer, listed)?;
         self.check_certificate(end_entity, list, presented.as_ref(), now)
     }
 
-    /// Judges a listed certificate, which needs no list: the operator vouches for it. The list that its
-    /// authority has signed counts. If that is not among the listed `authorities`, or has signed none,
-    /// nobody knows whose lists those of its name are: any of them counts.
+    /// Judges a listed certificate, which needs no list: the operator vouches for it. The newest list
+    /// that its authority has signed counts, if that is listed. Before it, and if it is not, nobody
+    /// knows whose lists those of its name are: the newest of each key counts, except those that are
+    /// provably of another authority.
     ///
     /// # Errors
     /// It is revoked.
-    pub(super) fn judge_listed<'p>(
+    pub(super) fn judge_listed(
         &self,
         certificate: &Cert<'_>,
         parsed: &Parsed,
-        mut authorities: impl Iterator<Item = &'p Parsed>,
+        listed: &[Listed],
     ) -> Result<(), webpki::Error> {
         let is_for = |list: &&List| list.is_for(certificate, parsed, !parsed.has_ca_flag());
         let lists = || self.lists.iter().filter(is_for);
@@ -219,24 +247,50 @@ impl Lists {
         if lists().all(|list| list.check(certificate).is_ok()) {
             return Ok(());
         }
-        let authority = authorities.find(|each| parsed.is_signed_by(each));
-        let own = authority.and_then(|each| lists().find(|list| list.is_signed_by(each)));
-        own.map_or(Err(webpki::Error::CertRevoked), |list| list.check(certificate))
+        let mut authorities = listed.iter().filter(|each| each.is_authority());
+        let issuer =
+            authorities.find(|each| parsed.is_signed_by(&each.parsed)).map(|each| &each.parsed);
+        // Without an issuer, a list that a listed authority has signed is not provably of another: the
+        // signature of the certificate may be an unsupported one of the same key.
+        let (key, others) = match issuer {
+            Some(issuer) => (issuer.own_key(), listed),
+            None => (parsed.authority_key(), &[][..]),
+        };
+        let mut judged = Vec::new();
+        for list in lists() {
+            if issuer.is_some_and(|issuer| list.is_signed_by(issuer)) {
+                return list.check(certificate);
+            }
+            let named = list.authority_key();
+            if !judged.contains(&named) && !list.is_of_another(key.as_ref(), others) {
+                list.check(certificate)?;
+                judged.push(named);
+            }
+        }
+        Ok(())
     }
 
-    /// The list of the issuer of a certificate. Another authority may have the same name: an earlier
-    /// or later one, with another key.
+    /// The newest list of the issuer of a certificate. Another authority may have the same name: an
+    /// earlier or later one, with another key.
     fn find_list(
         &self,
         certificate: &Cert<'_>,
         parsed: &Parsed,
         is_end_entity: bool,
         issuer: &Parsed,
+        listed: &[Listed],
     ) -> Result<&List, webpki::Error> {
-        let mut lists =
-            self.lists.iter().filter(|list| list.is_for(certificate, parsed, is_end_entity));
-        let found = lists.find(|list| list.is_signed_by(issuer));
-        found.ok_or(webpki::Error::UnknownRevocationStatus)
+        for list in self.lists.iter().filter(|each| each.is_for(certificate, parsed, is_end_entity))
+        {
+            if list.is_signed_by(issuer) {
+                return Ok(list);
+            }
+            // If it is of the issuer, an older one knows less.
+            if !list.is_of_another(issuer.own_key().as_ref(), listed) {
+                break;
+            }
+        }
+        Err(webpki::Error::UnknownRevocationStatus)
     }
 
     /// Judges a certificate by its list. Its issuer was presented, or is the listed authority, whose
@@ -474,13 +528,61 @@ mod tests {
     }
 
     #[test]
+    fn an_older_list_does_not_count_after_one_whose_signature_can_not_be_verified() {
+        let [root, twin] = [0; 2].map(|_| Owner::authority("root", None));
+        let leaf = Owner::new("leaf", Some(&root), numbered(4));
+        let between = intermediate(&root, &[]);
+        let below = Owner::new("below", Some(&between), numbered(6));
+        let older = list(&root, &[], None);
+        let damaged = |mut list: Vec<u8>| {
+            *list.last_mut().unwrap() ^= 1;
+            list
+        };
+        for newer in [list(&root, &[&leaf, &between], None), version_1(&root, &[&leaf, &between])] {
+            let lists = [damaged(newer), older.clone(), version_1(&between, &[])];
+            assert_eq!(judged(&root, &lists, &[&leaf]), "unknown_revocation");
+            assert_eq!(judged_by(&[&root, &leaf], &lists, &[&leaf]), "revoked");
+            assert_eq!(judged_by(&[&root, &between], &lists, &[&below]), "revoked");
+        }
+        // A list that names another key is not one of this authority.
+        let lists = [list(&twin, &[&leaf], None), older.clone()];
+        assert_eq!(judged(&root, &lists, &[&leaf]), "");
+        let lists = [version_1(&twin, &[&leaf]), older];
+        assert_eq!(judged(&root, &lists, &[&leaf]), "unknown_revocation");
+        assert_eq!(judged_by(&[&root, &twin], &lists, &[&leaf]), "");
+    }
+
+    #[test]
+    fn without_the_authority_of_a_listed_certificate_the_newest_list_of_its_key_counts() {
+        let [root, twin] = [0; 2].map(|_| Owner::authority("root", None));
+        let between = Owner::new("between", Some(&root), |params| {
+            numbered(3)(params);
+            params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+            params.use_authority_key_identifier_extension = true;
+        });
+        let leaf = Owner::new("leaf", Some(&between), numbered(4));
+        let reason = |lists: [Vec<u8>; 2]| {
+            let lists = [&lists[..], &[version_1(&between, &[])]].concat();
+            judged(&between, &lists, &[&leaf])
+        };
+        let revokes = |by: &Owner| list(by, &[&between], None);
+        let revokes_none = |by: &Owner| list(by, &[], None);
+        assert_eq!(reason([revokes(&twin), revokes_none(&root)]), "");
+        assert_eq!(reason([revokes_none(&twin), revokes(&root)]), "revoked");
+        assert_eq!(reason([revokes_none(&root), revokes(&root)]), "");
+        assert_eq!(reason([revokes(&root), revokes_none(&root)]), "revoked");
+        assert_eq!(reason([version_1(&twin, &[]), revokes(&root)]), "revoked");
+    }
+
+    #[test]
     fn a_listed_certificate_is_judged_by_the_list_that_its_listed_authority_has_signed() {
         let (root, twin) = (Owner::authority("root", None), Owner::authority("root", None));
         let leaf = Owner::new("leaf", Some(&root), numbered(4));
         let reason = |lists: &[Vec<u8>]| judged_by(&[&leaf, &root], lists, &[&leaf]);
         let revokes = |by| version_1(by, &[&leaf]);
         let revokes_none = |by| version_1(by, &[]);
-        assert_eq!(reason(&[revokes(&twin), revokes_none(&root)]), "");
+        assert_eq!(reason(&[list(&twin, &[&leaf], None), revokes_none(&root)]), "");
+        assert_eq!(reason(&[revokes_none(&root), revokes(&twin)]), "");
         assert_eq!(reason(&[revokes_none(&twin), revokes(&root)]), "revoked");
         // Nobody knows whose list it is: a client that may be revoked is refused.
         assert_eq!(reason(&[revokes(&twin)]), "revoked");

@@ -127,9 +127,7 @@ impl Trust {
     /// A listed certificate is revoked.
     fn judge_listed(&self, listed: &Listed) -> Result<(), webpki::Error> {
         let certificate = EndEntityCert::try_from(&listed.certificate)?;
-        let authorities = self.listed.iter().filter(|each| each.is_authority());
-        let authorities = authorities.map(|each| &each.parsed);
-        self.lists.judge_listed(&certificate, &listed.parsed, authorities)
+        self.lists.judge_listed(&certificate, &listed.parsed, &self.listed)
     }
 
     /// Looks for an authority that issued the certificate.
@@ -158,7 +156,7 @@ impl Trust {
             // Of two certificates with the same name and key, only one may be revoked.
             let valid = allowed.into_iter().find(|listed| self.judge_listed(listed).is_ok());
             let authority = valid.ok_or(webpki::Error::CertRevoked)?;
-            self.lists.judge(verified, &authority.parsed, path.now)
+            self.lists.judge(verified, &authority.parsed, &self.listed, path.now)
         };
         path.end_entity.verify_for_usage(
             ALGORITHMS.all,
