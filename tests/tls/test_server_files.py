@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from click.testing import CliRunner
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
 
 from holdfast import _core
 from holdfast.cli import main
@@ -17,7 +19,7 @@ from holdfast.config import ConfigError
 from holdfast.server.options import STREAM_DEFAULTS
 from support import wire
 from support.certificate_cases import CA, NAME, SIGNS, Mint
-from support.certificates import FUTURE, PAST, Certificates, named
+from support.certificates import FUTURE, PAST, Certificates, Issued, named
 from support.tls_peer import configuration, context, reasons, verdict
 
 if TYPE_CHECKING:
@@ -173,6 +175,38 @@ def test_a_list_of_an_authority_of_the_same_name_is_doubtful(
     appliance = run(plant.config(crl_file=twin).read_text())
     assert verdict(appliance, plant.trust()).endswith("ALERT_CERTIFICATE_UNKNOWN")
     assert reasons(appliance, caplog) == ["unknown_revocation"]
+
+
+def test_a_list_whose_signature_can_not_be_verified_is_doubtful(
+    plant: Plant, run: Run, caplog: pytest.LogCaptureFixture
+) -> None:
+    older = plant.joined("older.crl", plant.authority.revoke())
+    newer = x509.load_pem_x509_crl(plant.authority.revoke(plant.client).read_bytes())
+    der = newer.public_bytes(Encoding.DER)
+    damaged = x509.load_der_x509_crl(der[:-1] + bytes([der[-1] ^ 1]))
+    file = plant.folder / "damaged.crl"
+    file.write_bytes(damaged.public_bytes(Encoding.PEM))
+    both = plant.joined("both.crl", older, file)
+    assert plant.warnings(crl_file=both) == [
+        "revocation list 2 (CN=plant) has a signature that can't be verified with the key of the "
+        "authority of that name in ca_file (allowed: SHA-256, SHA-384 or SHA-512): the clients of "
+        "that authority are refused, unless it has signed a newer list"
+    ]
+    appliance = run(plant.config(crl_file=both).read_text())
+    assert verdict(appliance, plant.trust()).endswith("ALERT_CERTIFICATE_UNKNOWN")
+    assert reasons(appliance, caplog) == ["unknown_revocation"]
+
+
+def test_a_listed_certificate_that_is_revoked_is_doubtful(plant: Plant, mint: Mint) -> None:
+    root = Issued(plant.authority.ca, plant.authority.key)
+    between = mint.make(by=root, name="between", extensions=(CA, SIGNS))
+    crl = plant.authority.revoke(between, plant.client)
+    both = plant.joined("both.pem", between.certificate, plant.client.certificate)
+    assert plant.warnings(ca_file=both, crl_file=crl) == [
+        "certificate 1 of ca_file (CN=between) is revoked: its clients are refused",
+        "certificate 2 of ca_file (CN=client) is revoked: this client is refused",
+        "found no list of certificate 1 of ca_file (CN=between): its clients are refused",
+    ]
 
 
 def test_a_list_can_revoke_a_client_that_is_listed_without_its_authority(

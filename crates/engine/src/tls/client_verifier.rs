@@ -50,14 +50,13 @@ impl Clients {
                 );
                 return Err(FileError::content(file, flaw));
             }
-            Some(file) => {
-                let lists = List::of_file(file)?;
-                doubts.of_lists(file, &lists, &listed);
-                lists
-            }
+            Some(file) => List::of_file(file)?,
             None => Vec::new(),
         };
         let trust = Trust::new(listed, Lists { lists, expired: files.expired_lists });
+        if let Some(file) = &files.crl_file {
+            doubts.of_lists(file, &trust);
+        }
         Ok(Some(Clients { trust, accepted_issuers, roles: files.roles.clone() }))
     }
 

@@ -9,7 +9,7 @@ use super::certificate::{Parsed, name_text};
 use super::failure::{between, span};
 use super::revocation::List;
 use super::server_files::{ExpiredLists, ServerFiles};
-use super::verification::Listed;
+use super::verification::{Listed, Trust};
 
 /// Finds what is doubtful.
 pub(super) struct Doubts<'f> {
@@ -39,11 +39,7 @@ impl<'f> Doubts<'f> {
     pub(super) fn of_listed(&mut self, file: &Path, listed: &[Listed]) {
         for (each, number) in listed.iter().zip(1..) {
             let parsed = &each.parsed;
-            let outcome = match each.is_authority() {
-                true => "its clients are refused",
-                false => "this client is refused",
-            };
-            self.of_dates(file, parsed, number, outcome);
+            self.of_dates(file, parsed, number, outcome(each));
             let mut others = listed.iter().zip(1..).filter(|(other, _)| other.is_authority());
             if !each.is_authority()
                 && let Some((_, issuer)) =
@@ -76,7 +72,8 @@ impl<'f> Doubts<'f> {
         }
     }
 
-    pub(super) fn of_lists(&mut self, file: &Path, lists: &[List], listed: &[Listed]) {
+    pub(super) fn of_lists(&mut self, file: &Path, trust: &Trust) {
+        let (lists, listed) = (&trust.lists.lists, &trust.listed);
         let ca_key = self.files.protocol.ca_key();
         let authorities: Vec<_> =
             listed.iter().zip(1..).filter(|(each, _)| each.is_authority()).collect();
@@ -86,21 +83,29 @@ impl<'f> Doubts<'f> {
                 let issued = |each: &&(&Listed, usize)| each.0.parsed.has_subject(list.issuer());
                 authorities.iter().filter(issued)
             };
-            // A client can be listed without its authority.
-            let is_of_client =
-                |each: &Listed| !each.is_authority() && each.parsed.has_issuer(list.issuer());
+            // A certificate can be listed without its authority.
+            let is_of_listed = |each: &Listed| each.parsed.has_issuer(list.issuer());
             let is_named = named().next().is_some();
-            if !is_named && !listed.iter().any(is_of_client) {
+            if !is_named && !listed.iter().any(is_of_listed) {
                 self.add(file, &format!(
                     "{name} is not of an authority in {ca_key}: it applies only to clients that \
                      send its authority"
                 ));
             }
             if is_named && !named().any(|(each, _)| list.is_signed_by(&each.parsed)) {
-                self.add(file, &format!(
-                    "{name} is not signed by the authority of that name in {ca_key}: it does not \
-                     count for the clients of that authority"
-                ));
+                let mut keys = named().map(|(each, _)| each.parsed.own_key());
+                let flaw = match keys.all(|key| list.is_of_another(key.as_ref(), listed)) {
+                    true => format!(
+                        "is not signed by the authority of that name in {ca_key}: it does not count \
+                         for the clients of that authority"
+                    ),
+                    false => format!(
+                        "has a signature that can't be verified with the key of the authority of \
+                         that name in {ca_key} (allowed: SHA-256, SHA-384 or SHA-512): the clients of \
+                         that authority are refused, unless it has signed a newer list"
+                    ),
+                };
+                self.add(file, &format!("{name} {flaw}"));
             }
             self.of_age(file, list, &name);
             let missing = list.missing();
@@ -111,6 +116,14 @@ impl<'f> Doubts<'f> {
                      refuse it"
                 ));
             }
+        }
+        for (each, number) in listed.iter().zip(1..).filter(|(each, _)| trust.is_revoked(each)) {
+            let subject = each.parsed.subject_text();
+            let outcome = outcome(each);
+            self.add(
+                file,
+                &format!("certificate {number} of {ca_key} ({subject}) is revoked: {outcome}"),
+            );
         }
         for (each, number) in authorities {
             let has_issued = |list: &List| {
@@ -145,5 +158,13 @@ impl<'f> Doubts<'f> {
 
     fn add(&mut self, file: &Path, doubt: &str) {
         self.found.push(format!("{}: {doubt}", file.display()));
+    }
+}
+
+/// What follows if a listed certificate can't be used.
+fn outcome(listed: &Listed) -> &'static str {
+    match listed.is_authority() {
+        true => "its clients are refused",
+        false => "this client is refused",
     }
 }

@@ -616,6 +616,24 @@ mod tests {
     }
 
     #[test]
+    fn whoever_is_below_a_revoked_authority_is_refused_through_all_that_are_listed() {
+        let root = Owner::authority("root", None);
+        let first = intermediate(&root, &[]);
+        let second = Owner::authority("second", Some(&first));
+        let leaf = Owner::new("leaf", Some(&second), numbered(4));
+        let lists = |revoked: &[&Owner]| {
+            [version_1(&root, revoked), version_1(&first, &[]), version_1(&second, &[])]
+        };
+        let listed = [&leaf, &second, &first, &root];
+        for from in [0, 1] {
+            for chain in [&[&leaf][..], &[&leaf, &second, &first]] {
+                assert_eq!(judged_by(&listed[from..], &lists(&[]), chain), "");
+                assert_eq!(judged_by(&listed[from..], &lists(&[&first]), chain), "revoked");
+            }
+        }
+    }
+
+    #[test]
     fn an_authority_that_was_renewed_with_its_key_outlives_the_revoked_certificate() {
         let root = Owner::authority("root", None);
         let former = intermediate(&root, &[]);

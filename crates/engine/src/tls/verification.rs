@@ -84,13 +84,49 @@ impl Hash for Listed {
 /// The trusted certificates.
 #[derive(Debug)]
 pub(super) struct Trust {
-    listed: Arc<[Listed]>,
-    lists: Lists,
+    pub(super) listed: Arc<[Listed]>,
+    pub(super) lists: Lists,
+    /// Those of the listed certificates that are revoked.
+    revoked: Vec<CertificateDer<'static>>,
 }
 
 impl Trust {
     pub(super) fn new(listed: Arc<[Listed]>, lists: Lists) -> Trust {
-        Trust { listed, lists }
+        let mut trust = Trust { listed, lists, revoked: Vec::new() };
+        let mut found = trust.listed_that(|each| trust.is_revoked_by_list(each));
+        // So are those below, as on a presented path.
+        while !found.is_empty() {
+            trust.revoked.append(&mut found);
+            found = trust
+                .listed_that(|each| !trust.is_revoked(each) && trust.is_below_revoked_ones(each));
+        }
+        trust
+    }
+
+    fn listed_that(&self, is: impl Fn(&Listed) -> bool) -> Vec<CertificateDer<'static>> {
+        self.listed.iter().filter(|each| is(each)).map(|each| each.certificate.clone()).collect()
+    }
+
+    fn is_revoked_by_list(&self, listed: &Listed) -> bool {
+        let certificate = EndEntityCert::try_from(&listed.certificate);
+        // One that webpki can't read is no authority, and is refused when it is presented.
+        certificate.is_ok_and(|certificate| {
+            self.lists.judge_listed(&certificate, &listed.parsed, &self.listed).is_err()
+        })
+    }
+
+    /// Whether listed authorities have signed a listed certificate, and all of these are revoked: of two
+    /// with the same name and key, one may be valid.
+    fn is_below_revoked_ones(&self, listed: &Listed) -> bool {
+        let has_signed =
+            |each: &&Listed| each.is_authority() && listed.parsed.is_signed_by(&each.parsed);
+        let mut issuers = self.listed.iter().filter(has_signed).peekable();
+        issuers.peek().is_some() && issuers.all(|issuer| self.is_revoked(issuer))
+    }
+
+    /// Whether a listed certificate is revoked: by a list, or since those above it are.
+    pub(super) fn is_revoked(&self, listed: &Listed) -> bool {
+        self.revoked.contains(&listed.certificate)
     }
 
     /// Verifies the certificate of a peer, for its purpose. Does not check the name.
@@ -110,7 +146,10 @@ impl Trust {
         parsed.is_valid_at(now)?;
         parsed.is_for(purpose)?;
         if let Some(listed) = self.listed.iter().find(|listed| listed.certificate == *presented) {
-            return self.judge_listed(listed).map_err(refused);
+            return match self.is_revoked(listed) {
+                true => Err(CertificateError::Revoked.into()),
+                false => Ok(()),
+            };
         }
         // An authority is not a device: its own certificate must be listed to be accepted as one.
         if parsed.has_ca_flag() {
@@ -121,13 +160,6 @@ impl Trust {
             return Err(wrapped(TlsFailure::WrongKeyUsage));
         }
         self.find_issuer(&Path { end_entity: &end_entity, intermediates, purpose, now })
-    }
-
-    /// # Errors
-    /// A listed certificate is revoked.
-    fn judge_listed(&self, listed: &Listed) -> Result<(), webpki::Error> {
-        let certificate = EndEntityCert::try_from(&listed.certificate)?;
-        self.lists.judge_listed(&certificate, &listed.parsed, &self.listed)
     }
 
     /// Looks for an authority that issued the certificate.
@@ -153,8 +185,8 @@ impl Trust {
         let anchors: Vec<TrustAnchor<'_>> = anchors.map(borrow_anchor).collect();
         let check = |verified: &VerifiedPath<'_>| {
             let allowed = allowed(verified, authorities)?;
-            // Of two certificates with the same name and key, only one may be revoked.
-            let valid = allowed.into_iter().find(|listed| self.judge_listed(listed).is_ok());
+            // Of two certificates with the same name and key, it may be that only one is revoked.
+            let valid = allowed.into_iter().find(|listed| !self.is_revoked(listed));
             let authority = valid.ok_or(webpki::Error::CertRevoked)?;
             self.lists.judge(verified, &authority.parsed, &self.listed, path.now)
         };
