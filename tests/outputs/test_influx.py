@@ -233,6 +233,29 @@ def test_an_answer_that_repeats_the_credentials_is_shown_without_them(
         assert not any(part in str(refused.value) for part in ("one-", "bWU6"))
 
 
+@pytest.mark.parametrize(
+    ("password", "answer", "shown"),
+    [
+        ("p/a+s?>>>~~w", '{"got": "Basic bWU6cC9hK3M\\/Pj4+fn53"}', '{"got": "Basic ***"}'),
+        ("one-secret", "bad header: Basic bWU6b25lLXNl...", "bad header: Basic ***"),
+        ("two words and 2 more", "me:two words and 2 more", "me:***"),
+        ('pass word"s', '{"password": "pass word\\"s"}', '{"password": "***"}'),
+        ("a", "database is available again later", "database is available again later"),
+    ],
+)
+def test_credentials_are_not_shown_in_part_and_the_rest_is(
+    database: Database, tmp_path: Path, password: str, answer: str, shown: str
+) -> None:
+    (tmp_path / "s").write_text(password)
+    database.status, database.answer = 401, answer.encode()
+    given = {"username": "me", "password_file": str(tmp_path / "s")}
+    output = influx(f"{database.url}/write", **given)
+    with pytest.raises(OSError, match="HTTP 401: ") as refused:
+        output.send(numbered(1))
+    output.close()
+    assert str(refused.value).endswith(f"HTTP 401: {shown}")
+
+
 @pytest.mark.parametrize("says_so", [False, True])
 def test_a_connection_that_was_closed_meanwhile_is_opened_again(
     database: Database, says_so: bool, monkeypatch: pytest.MonkeyPatch

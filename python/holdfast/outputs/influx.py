@@ -6,6 +6,8 @@ import base64
 import contextlib
 import gzip
 import http.client
+import json
+import re
 import socket
 import threading
 from typing import TYPE_CHECKING
@@ -30,6 +32,9 @@ MAX_RESPONSE_BYTES = 65_536
 
 MAX_SHOWN_CHARS = 200
 """The characters of an error message of the receiver that are shown."""
+
+MIN_SECRET_CHARS = 4
+"""The characters of a password or token that is not shown, at least."""
 
 TOO_LARGE = 413
 
@@ -99,9 +104,11 @@ class Influx(Receiver):
             return 204, ""
         status, answer = self._answer(body)
         text = answer.decode("utf-8", "replace").strip()
-        for secret in filter(None, self._secrets):
-            # Some receivers, and proxies before them, repeat the headers that they got.
-            text = text.replace(secret, "***")
+        # Some receivers, and proxies before them, repeat the headers that they got, in part or with
+        # escaped characters. A shorter secret is also a part of words.
+        if whole := [each for each in self._secrets if len(each) >= MIN_SECRET_CHARS]:
+            begun = [re.escape(each[:8]) + r"[^\s\"']*" for each in whole]
+            text = re.sub("|".join([*map(re.escape, whole), *begun]), "***", text)
         text = text[:MAX_SHOWN_CHARS]
         message = f"{self._at}: HTTP {status}{': ' if text else ''}{text}"
         if 200 <= status < 300 or status in UNWANTED:
@@ -207,6 +214,6 @@ class Influx(Receiver):
         if settings.username is not None and settings.password_file is not None:
             password = read_secret(settings.password_file).strip()
             pair = base64.b64encode(f"{settings.username}:{password}".encode()).decode()
-            self._secrets = [pair, password]
+            self._secrets = [pair, password, json.dumps(password)[1:-1]]
             return {"Authorization": f"Basic {pair}"}
         return {}
