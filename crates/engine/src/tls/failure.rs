@@ -262,7 +262,7 @@ fn refusal(alert: AlertDescription) -> &'static str {
         AlertDescription::CertificateRevoked => "revoked",
         AlertDescription::AccessDenied => "access denied",
         AlertDescription::UnsupportedCertificate => "unsupported",
-        AlertDescription::CertificateUnknown => "for a reason that it does not name",
+        AlertDescription::CertificateUnknown => "no reason given",
         _ => "bad",
     }
 }
