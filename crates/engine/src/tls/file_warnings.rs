@@ -94,7 +94,9 @@ impl<'f> Doubts<'f> {
             }
             if is_named && !named().any(|(each, _)| list.is_signed_by(&each.parsed)) {
                 let mut keys = named().map(|(each, _)| each.parsed.own_key());
-                let flaw = match keys.all(|key| list.is_of_another(key.as_ref(), listed)) {
+                let flaw = match keys
+                    .all(|key| list.is_of_another(key.as_ref(), &trust.authorities()))
+                {
                     true => format!(
                         "is not signed by the authority of that name in {ca_key}: it does not count \
                          for the clients of that authority"

@@ -22,7 +22,6 @@ use x509_cert::time::Time;
 use super::certificate::{AnySerial, Parsed};
 use super::files::FileError;
 use super::server_files::ExpiredLists;
-use super::verification::Listed;
 
 /// The extensions that RFC 5280, 5.2 requires of every list. No judgement depends on them.
 const REQUIRED: [(ObjectIdentifier, &str); 2] =
@@ -136,16 +135,14 @@ impl List {
     pub(super) fn is_of_another(
         &self,
         issuer_key: Option<&OctetString>,
-        others: &[Listed],
+        others: &[&Parsed],
     ) -> bool {
         let names_another = match (self.authority_key(), issuer_key) {
             (Some(named), Some(key)) => named != *key,
             _ => false,
         };
-        let has_signed = |each: &Listed| {
-            let parsed = &each.parsed;
-            each.is_authority() && parsed.has_subject(self.issuer()) && self.is_signed_by(parsed)
-        };
+        let has_signed =
+            |each: &&Parsed| each.has_subject(self.issuer()) && self.is_signed_by(each);
         names_another || others.iter().any(has_signed)
     }
 
@@ -199,7 +196,7 @@ pub(super) struct Lists {
 }
 
 impl Lists {
-    /// Judges every certificate of a path to an authority, one of those `listed`.
+    /// Judges every certificate of a path to an authority, one of the `listed` ones.
     ///
     /// # Errors
     /// One is revoked, or no list tells that it is not.
@@ -207,7 +204,7 @@ impl Lists {
         &self,
         path: &VerifiedPath<'_>,
         authority: &Parsed,
-        listed: &[Listed],
+        listed: &[&Parsed],
         now: UnixTime,
     ) -> Result<(), webpki::Error> {
         if self.lists.is_empty() {
@@ -239,7 +236,7 @@ impl Lists {
         &self,
         certificate: &Cert<'_>,
         parsed: &Parsed,
-        listed: &[Listed],
+        listed: &[&Parsed],
     ) -> Result<(), webpki::Error> {
         let is_for = |list: &&List| list.is_for(certificate, parsed, !parsed.has_ca_flag());
         let lists = || self.lists.iter().filter(is_for);
@@ -247,9 +244,7 @@ impl Lists {
         if lists().all(|list| list.check(certificate).is_ok()) {
             return Ok(());
         }
-        let mut authorities = listed.iter().filter(|each| each.is_authority());
-        let issuer =
-            authorities.find(|each| parsed.is_signed_by(&each.parsed)).map(|each| &each.parsed);
+        let issuer = listed.iter().find(|each| parsed.is_signed_by(each));
         // Without an issuer, a list that a listed authority has signed is not provably of another: the
         // signature of the certificate may be an unsupported one of the same key.
         let (key, others) = match issuer {
@@ -278,7 +273,7 @@ impl Lists {
         parsed: &Parsed,
         is_end_entity: bool,
         issuer: &Parsed,
-        listed: &[Listed],
+        listed: &[&Parsed],
     ) -> Result<&List, webpki::Error> {
         for list in self.lists.iter().filter(|each| each.is_for(certificate, parsed, is_end_entity))
         {

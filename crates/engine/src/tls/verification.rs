@@ -107,11 +107,16 @@ impl Trust {
         self.listed.iter().filter(|each| is(each)).map(|each| each.certificate.clone()).collect()
     }
 
+    pub(super) fn authorities(&self) -> Vec<&Parsed> {
+        let authorities = self.listed.iter().filter(|each| each.is_authority());
+        authorities.map(|each| &each.parsed).collect()
+    }
+
     fn is_revoked_by_list(&self, listed: &Listed) -> bool {
         let certificate = EndEntityCert::try_from(&listed.certificate);
         // One that webpki can't read is no authority, and is refused when it is presented.
         certificate.is_ok_and(|certificate| {
-            self.lists.judge_listed(&certificate, &listed.parsed, &self.listed).is_err()
+            self.lists.judge_listed(&certificate, &listed.parsed, &self.authorities()).is_err()
         })
     }
 
@@ -188,7 +193,7 @@ impl Trust {
             // Of two certificates with the same name and key, it may be that only one is revoked.
             let valid = allowed.into_iter().find(|listed| !self.is_revoked(listed));
             let authority = valid.ok_or(webpki::Error::CertRevoked)?;
-            self.lists.judge(verified, &authority.parsed, &self.listed, path.now)
+            self.lists.judge(verified, &authority.parsed, &self.authorities(), path.now)
         };
         path.end_entity.verify_for_usage(
             ALGORITHMS.all,
