@@ -5,11 +5,11 @@ from __future__ import annotations
 import threading
 from contextlib import contextmanager
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast._core import Request
+from holdfast._core import Caller, Memory, Request
 from support import wire
 from support.fake_device import Stream
 from support.native_poller import (
@@ -31,7 +31,7 @@ WRITE = Request.write_register(3, 7)
 
 
 class Busy(Stream):
-    """A device that holds the reply to its first read until `go_on`."""
+    """Its unit 2 holds the reply to its first read until `go_on`."""
 
     is_modelled = False
 
@@ -45,7 +45,7 @@ class Busy(Stream):
             self.writes.append(asked.pdu)
             asked.answer(asked.pdu)
             return
-        if not self.is_reading.is_set():
+        if asked.unit == 2 and not self.is_reading.is_set():
             self.is_reading.set()
             assert self.go_on.wait(wire.DEADLINE)
         asked.answer(b"\x03\x02\0\0")
@@ -102,6 +102,45 @@ def test_a_write_that_waits_is_not_sent_once_its_device_has_gone(
         poller.add(made("b"))
         assert written(poller, poller.write("b", WRITE)) == 0
         assert len(line.writes) == 1
+
+
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda poller, _: poller.remove("a"),
+        lambda poller, made: poller.replace("a", made("a", unit=3)),
+    ],
+    ids=["removed", "another unit"],
+)
+def test_a_passed_write_that_waits_is_not_sent_once_its_device_has_gone(
+    poller: ReportingPoller, kind: str, change: Callable[[ReportingPoller, partial[Made]], object]
+) -> None:
+    mirror = Memory(holding_registers=1)
+    reads = [("holding_registers", 0, 1, (mirror, "holding_registers", 0, None))]
+    passage = poller.passage(mirror, ("holding_registers", 0, 1, "a", 0, False))
+    with busy(kind) as line, busy("tcp") as elsewhere:
+        made = partial(device, line, transport=kind, timeout=4 * wire.DEADLINE)
+        poller.add(made("a", reads=reads))
+        taken(poller, lambda polls, _: polls)
+        poller.add(made("slow", unit=2))
+        assert line.is_reading.wait(wire.DEADLINE)
+        caller = Caller()
+        ticket = passage.call(caller, "holding_registers", 0, [7])
+        poller.add(device(elsewhere, "elsewhere"))  # The write waits when this is polled.
+        taken(poller, lambda polls, _: polls)
+        change(poller, partial(made, reads=reads))
+        line.go_on.set()
+        ended: list[Any] = []
+
+        def has_ended() -> bool:
+            ended.extend(caller.take())
+            return bool(ended)
+
+        wire.until(has_ended, "the write has ended")
+        [(number, is_sent, error)] = ended
+        assert (number, is_sent, error.code) == (ticket, False, 10)
+        assert not line.writes
 
 
 @pytest.mark.parametrize("within", [-1.0, float("nan"), float("inf"), 1e9])

@@ -16,6 +16,7 @@ import pytest
 
 import holdfast
 from holdfast.adapters.rest.device_writes import MAX_WAITING, DeviceWrites
+from holdfast.config import load
 from holdfast.events.audit import Audit
 from holdfast.ingest import Grant, MemoryAccess, Refused
 from holdfast.net.http.requests import Request
@@ -196,6 +197,31 @@ def test_nothing_comes_between_the_read_and_the_write_of_function_22(run: Run) -
             goes_on.set()
             assert (low.result(), high.result()) == (None, None)
         assert source.model.values["holding_registers"][502] == 0x2211
+
+
+def test_what_function_22_read_is_not_written_once_its_device_has_gone(
+    run: Run, tmp_path: Path
+) -> None:
+    is_read, goes_on, file = threading.Event(), threading.Event(), tmp_path / "other.yaml"
+
+    def slow(asked: Asked) -> None:
+        if asked.pdu == b"\x03\x01\xf6\x00\x01":
+            is_read.set()
+            assert goes_on.wait(wire.DEADLINE)
+        asked.answer()
+
+    with plc(slow) as source, plc() as other, ThreadPoolExecutor(1) as threads:
+        appliance = started(run, source, emulate=True, timeout=wire.DEADLINE)
+        with client(appliance) as scada:
+            masked = threads.submit(scada.mask_write, 12, and_mask=0xFF00, or_mask=0x0011)
+            assert is_read.wait(wire.DEADLINE)
+            file.write_text(configuration({"other": device(other.url, *READS)}, **MORE))
+            appliance.reload(load(file))
+            wire.until(lambda: other.requests, "the device has gone")
+            goes_on.set()
+            with refused_with(10):
+                masked.result()
+        assert writes_of(source) == []
 
 
 @pytest.mark.parametrize("way", ["hang up", "do not answer", "refuse"])

@@ -11,7 +11,8 @@ from support import wire
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from holdfast._core import Request
+    from holdfast._core import Memory, Passage, Request
+    from holdfast.types import Area
     from support.fake_device import Stream
 
 Made: TypeAlias = "partial[PolledDevice]"
@@ -35,6 +36,9 @@ class ReportingPoller:
 
     def write(self, name: str, request: Request, *, within: float | None = None) -> int:
         return self._poller.write(name, request, self.results, within=within)
+
+    def passage(self, memory: Memory, *ranges: tuple[Area, int, int, str, int, bool]) -> Passage:
+        return self._poller.passage(memory, ranges)
 
     def remove(self, name: str) -> bool:
         return self._poller.remove(name)

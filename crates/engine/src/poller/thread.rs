@@ -633,6 +633,13 @@ impl Running {
         self.inbox.succeed(device);
     }
 
+    /// Of a write: it is sent only while its device is there.
+    fn permit(&self, until: Option<Instant>) -> Permit {
+        let device = self.writes.subscribe();
+        let wanted: Wanted = Arc::new(move |_| device.has_changed().is_ok());
+        Permit { fence: self.fence.clone(), until, wanted: Some(wanted) }
+    }
+
     /// Sends a write between two reads, as soon as possible. One that was sent has its result, even if the
     /// device is removed.
     fn write(
@@ -649,12 +656,11 @@ impl Running {
         // Set once, by the thread of the link or by the end of the device.
         let is_sent = Arc::new(OnceLock::new());
         let mut device = self.writes.subscribe();
-        let (sent, of) = (Arc::clone(&is_sent), device.clone());
-        let wanted: Wanted = Arc::new(move |is_sent| match is_sent {
+        let sent = Arc::clone(&is_sent);
+        let permit = self.permit(until).and(Arc::new(move |is_sent| match is_sent {
             true => *sent.get_or_init(|| true),
-            false => of.has_changed().is_ok(),
-        });
-        let permit = Permit { fence: self.fence.clone(), until, wanted: Some(wanted) };
+            false => true,
+        }));
         let withdrawn = async move {
             let _ends = device.changed().await;
             if *is_sent.get_or_init(|| false) {
@@ -690,7 +696,7 @@ impl Running {
         let (link, turn) = (Rc::clone(&self.link.0), Rc::clone(&self.turn));
         let (inbox, reads) = (Rc::clone(&self.inbox), Rc::clone(&self.reads));
         let Running { unit_id, timeout, release, .. } = *self;
-        let permit = Permit { fence: self.fence.clone(), ..Permit::default() };
+        let permit = self.permit(None);
         spawn_local(async move {
             let fence = permit.fence.as_ref();
             let Some(taken) = turn.take_to_write(fence, timeout).await else {

@@ -258,7 +258,7 @@ impl PassedWrite {
             self.refuse(ExceptionCode::GatewayPathUnavailable);
             return Vec::new();
         }
-        let of_client = Permit { wanted: Some(self.reply.wanted()), ..permit.clone() };
+        let of_client = permit.and(self.reply.wanted());
         let call = async |request: &EncodedRequest, permit| {
             link.call(unit_id, request, timeout, Priority::Urgent, permit).await
         };
@@ -298,8 +298,11 @@ impl PassedWrite {
             None => call(&self.request, &of_client).await,
         };
         let outcome = answered.as_ref().map(drop).map_err(|error| fault(error));
-        // Its client has gone, and it was not sent.
+        // Its device or its client has gone, and it was not sent.
         if outcome == Err(Fault::Expired) {
+            if !self.reply.is_unwanted() {
+                self.refuse(ExceptionCode::GatewayPathUnavailable);
+            }
             return Vec::new();
         }
         // Without the lease, nothing was sent.

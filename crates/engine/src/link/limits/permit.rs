@@ -40,6 +40,15 @@ impl Permit {
             && self.wanted.as_ref().is_none_or(|wanted| wanted(is_sent))
     }
 
+    /// This permit while `also` expects the request too.
+    pub fn and(&self, also: Wanted) -> Permit {
+        let wanted: Wanted = match self.wanted.clone() {
+            Some(wanted) => Arc::new(move |is_sent| wanted(is_sent) && also(is_sent)),
+            None => also,
+        };
+        Permit { wanted: Some(wanted), ..self.clone() }
+    }
+
     /// Waits for a turn; `None` if it does not come in time.
     pub async fn in_time<T>(&self, turn: impl Future<Output = T>) -> Option<T> {
         match self.until {
