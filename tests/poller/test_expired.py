@@ -78,6 +78,18 @@ def test_a_write_that_waits_for_another_device_of_its_connection(
         assert len(line.writes) == 1
 
 
+def test_a_write_that_waits_for_the_end_of_the_connection_before(
+    poller: ReportingPoller,
+) -> None:
+    with busy("rtu+tcp") as line:
+        made = partial(device, line, transport="rtu+tcp")
+        poller.add(made("slow", unit=2, timeout=4 * wire.DEADLINE))
+        assert line.is_reading.wait(wire.DEADLINE)
+        poller.remove("slow")
+        poller.add(made("a", timeout=0.1, in_flight=2, start_within=3600.0))
+        assert written(poller, poller.write("a", WRITE, within=0.05)) == EXPIRED
+
+
 @pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
 @pytest.mark.parametrize(
     "change",

@@ -470,8 +470,9 @@ def adapter(device: Path, value: int) -> Serial:
     return Serial(RTU, device, then=lambda asked: asked.answer(registers(asked.pdu, value)))
 
 
+@pytest.mark.parametrize("between", [False, True], ids=["", "after others"])
 def test_a_line_is_closed_before_it_is_opened_with_other_settings(
-    poller: Poller, device: holdfast.Server, tmp_path: Path
+    poller: Poller, device: holdfast.Server, tmp_path: Path, *, between: bool
 ) -> None:
     begun, go_on = threading.Event(), threading.Event()
 
@@ -485,9 +486,15 @@ def test_a_line_is_closed_before_it_is_opened_with_other_settings(
         poller.add(line.url, tags, name="a", timeout=2 * wire.DEADLINE)
         assert begun.wait(wire.DEADLINE)
         poller.remove("a")
-        poller.add(f"{line.url}&close_after=3", tags, name="b", timeout=2 * wire.DEADLINE)
         poller.add(url(device), {"y": ("coils", 3)}, name="other", interval=0.01)
-        wire.until(lambda: poller.counters()["other"]["polls"] >= 5, "b had time to open it")
+        if between:
+            poller.add(f"{line.url}&close_after=4", tags, name="between")
+            poller.remove("between")
+            wire.until(lambda: poller.counters()["other"]["polls"] >= 5, "it had time to close")
+        url_of_b = f"{line.url}&close_after=3"
+        poller.add(url_of_b, tags, name="b", interval=0.01, timeout=2 * wire.DEADLINE)
+        polls = poller.counters()["other"]["polls"] + 5
+        wire.until(lambda: poller.counters()["other"]["polls"] >= polls, "b had time to open it")
         go_on.set()
         found: list[Reading] = []
 

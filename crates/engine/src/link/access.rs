@@ -66,9 +66,19 @@ impl Link {
         self.before.replace(all);
     }
 
-    /// Closes the connection behind the requests that were sent.
+    /// Waits until the links before this one are closed.
+    async fn begin(&self) {
+        let before = self.before.borrow().clone();
+        for link in before {
+            // In a box, as this closes a link that may have had one before it.
+            Box::pin(link.close()).await;
+        }
+        self.before.borrow_mut().clear();
+    }
+
+    /// Closes the connection behind the requests that were sent, and the links before this one first.
     pub(crate) async fn close(&self) {
-        let _alone: Alone<'_> = self.pace.alone(POLLER, Priority::Urgent).await;
+        let _alone = self.alone().await;
         self.release();
         if let Wire::Blocking(link) = &self.wire {
             // Its thread has closed the connection when it refuses this one.
@@ -121,7 +131,7 @@ impl Link {
         timeout: Duration,
         permit: &Permit,
     ) -> Exchanged {
-        let _alone: Alone<'_> = self.pace.alone(POLLER, Priority::Urgent).await;
+        let _alone = self.alone().await;
         let answer = self.exchange(unit_id, read, timeout, true, permit).await?;
         let invalid = || ClientError::Invalid(InvalidResponse::Pdu(ResponseError::Length));
         let write = write(&answer).ok_or_else(invalid)?;
@@ -130,7 +140,16 @@ impl Link {
 
     /// Waits for a turn, which lasts as long as the result.
     pub(super) async fn turn(&self, source: u64, priority: Priority) -> Turn<'_> {
-        self.pace.place(source, priority).await
+        let turn = self.pace.place(source, priority).await;
+        self.begin().await;
+        turn
+    }
+
+    /// Waits for a turn in which no other request is in flight.
+    async fn alone(&self) -> Alone<'_> {
+        let alone = self.pace.alone(POLLER, Priority::Urgent).await;
+        self.begin().await;
+        alone
     }
 
     /// Sends a request and waits for the answer. With `eager`, an unreachable address is tried even
@@ -143,11 +162,6 @@ impl Link {
         eager: bool,
         permit: &Permit,
     ) -> Exchanged {
-        let before = self.before.borrow().clone();
-        for link in &before {
-            link.close().await;
-        }
-        self.before.borrow_mut().clear();
         self.note_change(request);
         let answer = match &self.wire {
             Wire::Tcp(link) => {
