@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast._core import Endpoint, Poller, Request
+from holdfast.client.endpoint import endpoint
+from holdfast.client.url import parse
 from support import wire
-from support.fake_device import HANG_UP
+from support.fake_device import HANG_UP, Serial
+from support.lines import RTU
 from support.native_poller import (
     INVALID,
     REFUSED,
@@ -17,6 +20,7 @@ from support.native_poller import (
     TIMEOUT,
     ReportingPoller,
     device,
+    device_at,
     taken,
     written,
 )
@@ -24,8 +28,10 @@ from support.polled import Fake, asked, data, exception, reply
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from holdfast.types import Forward
+    from support.fake_device import Asked
 
 
 def writable(request: wire.Frame) -> bytes:
@@ -122,6 +128,33 @@ def test_the_end_of_a_device_ends_the_writes_that_were_not_sent(poller: Reportin
         go_on.set()
         assert written(poller, number) == 0
         assert [each.pdu[0] for each in fake.requests].count(6) == 1
+
+
+def test_a_forgotten_link_is_closed_before_the_next_one_is_opened(
+    poller: ReportingPoller, tmp_path: Path
+) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def hold(asked: Asked) -> None:
+        begun.set()
+        assert go_on.wait(wire.DEADLINE)
+        asked.answer()
+
+    with Serial(RTU, tmp_path / "line", hold) as line, Fake(data) as elsewhere:
+        at, other = (endpoint(parse(line.url + more)) for more in ("", "&close_after=3"))
+        link = poller.link(at)
+        poller.add(device_at(at, "a", timeout=2 * wire.DEADLINE))
+        assert begun.wait(wire.DEADLINE)
+        poller.remove("a")
+        del link
+        poller.forget_links()
+        poller.add(device_at(other, "b", timeout=2 * wire.DEADLINE))
+        poller.add(device(elsewhere, "elsewhere", interval=0.01))
+        wire.until(lambda: poller.counters()["elsewhere"]["polls"] >= 5, "b had time to open it")
+        go_on.set()
+        polls, _ = taken(poller, lambda polls, _: "b" in {name for name, *_ in polls})
+        [[block]] = [blocks for name, _, blocks in polls if name == "b"]
+        assert block[4] == 0
 
 
 def test_the_end_of_a_poller_ends_the_wait_for_results() -> None:

@@ -11,7 +11,7 @@ from support import wire
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from holdfast._core import Memory, Passage, Request
+    from holdfast._core import Link, Memory, Passage, Request
     from holdfast.types import Area
     from support.fake_device import Stream
 
@@ -40,6 +40,13 @@ class ReportingPoller:
     def passage(self, memory: Memory, *ranges: tuple[Area, int, int, str, int, bool]) -> Passage:
         return self._poller.passage(memory, ranges)
 
+    def link(self, endpoint: Endpoint) -> Link:
+        return self._poller.link(endpoint)
+
+    def forget_links(self) -> None:
+        """Forgets all links that no device has."""
+        self._poller.forget_links([])
+
     def remove(self, name: str) -> bool:
         return self._poller.remove(name)
 
@@ -51,6 +58,10 @@ class ReportingPoller:
 
 
 def device(fake: Stream, name: str = "a", *, transport: Any = "tcp", **more: Any) -> Made:
+    return device_at(Endpoint.network(transport, "127.0.0.1", fake.port), name, **more)
+
+
+def device_at(endpoint: Endpoint, name: str, **more: Any) -> Made:
     settings: dict[str, Any] = {
         "unit": 1,
         "interval": 3600.0,
@@ -58,7 +69,6 @@ def device(fake: Stream, name: str = "a", *, transport: Any = "tcp", **more: Any
         "reads": [("holding_registers", 0, 1, None)],
         "start_within": 0.0,
     }
-    endpoint = Endpoint.network(transport, "127.0.0.1", fake.port)
     return partial(PolledDevice, name, endpoint, **(settings | more))
 
 

@@ -500,11 +500,11 @@ async fn run_commands(
                 // It is in use until nobody can call it any more.
                 spawn_local(async move {
                     serve(Rc::clone(&link.0), *settings, shared, calls).await;
-                    drop(link);
+                    link.leave();
                 });
             }
             Command::Forget(address) => {
-                links.by_address.remove(&address);
+                links.forget(&address);
             }
             Command::Remove(name) => {
                 let removed = running.remove(&name);
@@ -749,6 +749,15 @@ fn made(
 /// A link that devices or listeners use. What a removed device has sent may still hold the link itself.
 struct UsedLink(Rc<Link>);
 
+impl UsedLink {
+    /// One of its users has left. It is closed if no one else uses it.
+    fn leave(self: Rc<UsedLink>) {
+        if let Some(UsedLink(link)) = Rc::into_inner(self) {
+            spawn_local(async move { link.close().await });
+        }
+    }
+}
+
 /// The last link to an address.
 struct KnownLink {
     used: rc::Weak<UsedLink>,
@@ -760,7 +769,7 @@ struct KnownLink {
 #[derive(Default)]
 struct Links {
     by_address: HashMap<Address, KnownLink>,
-    /// How often a device has left its link since those without devices were removed.
+    /// How often a link has lost a user since those that have ended were removed.
     departures: usize,
 }
 
@@ -787,12 +796,21 @@ impl Links {
         used
     }
 
-    /// A device has left its link, which is closed if no one else uses it. Removing links looks at all of
-    /// them, so it waits until it may find many.
-    fn device_left(&mut self, left: Rc<UsedLink>) {
-        if let Some(UsedLink(link)) = Rc::into_inner(left) {
-            spawn_local(async move { link.close().await });
+    /// The next user of the address gets a new link, which follows this one.
+    fn forget(&mut self, address: &Address) {
+        if let Some(known) = self.by_address.get_mut(address) {
+            known.used = rc::Weak::new();
         }
+        self.departed();
+    }
+
+    fn device_left(&mut self, left: Rc<UsedLink>) {
+        left.leave();
+        self.departed();
+    }
+
+    /// Removes links that have ended. This looks at all of them, so it waits until it may find many.
+    fn departed(&mut self) {
         self.departures += 1;
         if 2 * self.departures >= self.by_address.len() {
             self.by_address.retain(|_, known| known.link.strong_count() > 0);
