@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import random
 import re
 import sys
@@ -252,7 +253,7 @@ def test_a_bool_is_no_register(area: Area, memory: holdfast.Memory) -> None:
         "101",
         b"\x01\x00",
         bytearray(b"\x01"),
-        memoryview(b"\x01"),
+        memoryview(b"\x01").cast("c"),
         1,
         None,
         {1: 0},
@@ -266,6 +267,19 @@ def test_values_that_are_no_sequence_of_numbers_are_a_type_error(
     with pytest.raises(TypeError):
         memory.write(area, 0, values)
     assert memory.read(area, 0, 8) == [0] * 8
+
+
+@each_register_area
+@pytest.mark.parametrize("owner", [b"\x01", (ctypes.c_ubyte * 1)(1)], ids=["bytes", "ctypes"])
+def test_a_view_of_bytes_is_no_registers(area: Area, owner: Any, memory: holdfast.Memory) -> None:
+    with pytest.raises(TypeError, match="values are memoryview"):
+        memory.write(area, 0, memoryview(owner))
+
+
+@pytest.mark.parametrize("view", [memoryview(b"\x01\0"), memoryview(b"\x01\0").cast("?")])
+def test_a_view_of_zeros_and_ones_is_bits(view: Any, memory: holdfast.Memory) -> None:
+    memory.write("coils", 0, view)
+    assert memory.read("coils", 0, 2) == [1, 0]
 
 
 @each_area

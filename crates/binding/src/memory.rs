@@ -442,7 +442,7 @@ pub fn numbers<'py>(area: Area, values: &Bound<'py, PyAny>) -> PyResult<Vec<u16>
         let items = list.iter().enumerate();
         return items.map(|(index, value)| number(area, index, &value, shown)).collect();
     }
-    if is_text(values) || is_unordered(values) {
+    if is_text(values) || is_unordered(values) || (!area.is_bits() && is_view_of_bytes(values)) {
         let found = values.get_type().name()?;
         return Err(PyTypeError::new_err(format!(
             "values are {found}, not a sequence of integers"
@@ -457,14 +457,17 @@ pub fn numbers<'py>(area: Area, values: &Bound<'py, PyAny>) -> PyResult<Vec<u16>
 
 /// Whether this is text or bytes. Both are iterable, but are not accepted as values.
 pub fn is_text(values: &Bound<'_, PyAny>) -> bool {
-    let is_view_of_bytes = || {
-        let size = values.cast::<PyMemoryView>().ok().map(|view| view.getattr("itemsize"));
-        size.is_some_and(|size| size.is_ok_and(|size| size.eq(1).unwrap_or(false)))
-    };
     values.is_instance_of::<PyString>()
         || values.is_instance_of::<PyBytes>()
         || values.is_instance_of::<PyByteArray>()
-        || is_view_of_bytes()
+}
+
+/// Whether this is a view of bytes: each would become a register. As bits, its items may be 0 and 1.
+fn is_view_of_bytes(values: &Bound<'_, PyAny>) -> bool {
+    let format = values.cast::<PyMemoryView>().ok().and_then(|view| view.getattr("format").ok());
+    let format = format.and_then(|format| format.extract::<String>().ok());
+    // As ctypes has it, `<B`.
+    format.is_some_and(|format| matches!(format.trim_start_matches('<'), "B" | "c"))
 }
 
 /// Whether this is a mapping, whose keys would be its values, or a set.
