@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from holdfast.outputs import Buffer
 from holdfast.outputs.buffer import MAX_ROW
 from holdfast.outputs.buffer_file import Stored
-from holdfast.outputs.file_gone import FileGone
+from holdfast.outputs.buffer_file_error import FileGone
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.tag_meaning import meaning_of
 from holdfast.tags import Tag

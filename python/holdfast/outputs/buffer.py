@@ -9,7 +9,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from holdfast.config.models.outputs import MAX_VALUES
-from holdfast.outputs.file_gone import FileGone
+from holdfast.outputs.buffer_file_error import FileGone
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

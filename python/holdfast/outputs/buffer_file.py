@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.outputs.file_gone import FileGone
+from holdfast.outputs.buffer_file_error import FileGone
 from holdfast.outputs.tag_meaning import described, meaning_of, tag_from
 from holdfast.polling import Reading
 from holdfast.tags import Tag

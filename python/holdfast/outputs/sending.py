@@ -10,7 +10,7 @@ from math import inf
 from typing import TYPE_CHECKING, Protocol
 
 from holdfast.events import log_lines
-from holdfast.outputs.file_gone import FileGone
+from holdfast.outputs.buffer_file_error import FileGone
 from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
