@@ -14,6 +14,7 @@ from support.cli import answer, invoke
 from support.fake_device import FakeDevice
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from holdfast.cli.signals import Signals
@@ -100,6 +101,15 @@ def test_a_write_that_is_interrupted_was_possibly_carried_out(
     assert (found["target"], found["maybe_written"]) == (url, True)
 
 
+@pytest.fixture
+def heard() -> Iterator[None]:
+    """Ctrl-C counts, also if the tests run in the background of a shell, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heard")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_what_was_written_is_told_if_reading_it_back_is_interrupted(
     tmp_path: Path, number: signal.Signals
