@@ -108,11 +108,11 @@ def test_a_log_is_kept_by_as_many_servers_as_wanted(
     file = configuration(tmp_path, servers=urls(cluster), replicas=3)
     with Appliance(load(file)) as appliance:
 
-        def is_told() -> bool:
+        def is_logged() -> bool:
             appliance.log_events(0)
             return bool(told())
 
-        wire.until(is_told, "it is told")
+        wire.until(is_logged, "the event is logged")
         assert told() == [{"log": "site", "replicas": "1", "configured": "3"}]
         assert appliance.replicas()["site"]["replicas"] == 1
         name = "holdfast-log-site"

@@ -90,8 +90,7 @@ def test_a_write_that_waits_for_the_end_of_the_connection_before(
         assert written(poller, poller.write("a", WRITE, within=0.05)) == EXPIRED
 
 
-@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
-@pytest.mark.parametrize(
+each_way_to_go = pytest.mark.parametrize(
     "change",
     [
         lambda poller, _: poller.remove("a"),
@@ -99,6 +98,10 @@ def test_a_write_that_waits_for_the_end_of_the_connection_before(
     ],
     ids=["removed", "another unit"],
 )
+
+
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
+@each_way_to_go
 def test_a_write_that_waits_is_not_sent_once_its_device_has_gone(
     poller: ReportingPoller, kind: str, change: Callable[[ReportingPoller, partial[Made]], object]
 ) -> None:
@@ -117,14 +120,7 @@ def test_a_write_that_waits_is_not_sent_once_its_device_has_gone(
 
 
 @pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda poller, _: poller.remove("a"),
-        lambda poller, made: poller.replace("a", made("a", unit=3)),
-    ],
-    ids=["removed", "another unit"],
-)
+@each_way_to_go
 def test_a_passed_write_that_waits_is_not_sent_once_its_device_has_gone(
     poller: ReportingPoller, kind: str, change: Callable[[ReportingPoller, partial[Made]], object]
 ) -> None:

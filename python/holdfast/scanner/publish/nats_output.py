@@ -117,7 +117,7 @@ class NatsOutput(Receiver):
         reasons += self._forbidden
         forbidden = {reason.partition('"')[2].rpartition('"')[0] for reason in self._forbidden}
         for subject, which in published.items():
-            if _as_told(subject) in forbidden:
+            if _as_reported(subject) in forbidden:
                 refused.update((subject, at) for at in which)
         for subject, at in refused:
             if subject.startswith(f"{self._prefix}.status."):
@@ -213,6 +213,6 @@ class NatsOutput(Receiver):
         ]
 
 
-def _as_told(subject: str) -> str:
+def _as_reported(subject: str) -> str:
     """A subject as in the error of the server, which quotes it, and of nats-py: in lower case."""
     return json.dumps(subject, ensure_ascii=False)[1:-1].lower()
