@@ -15,6 +15,7 @@ import re
 import signal
 import socket
 import struct
+import sys
 import threading
 import time
 import warnings
@@ -1164,6 +1165,40 @@ def test_every_event_loop_ends_calls_in_time_and_drops_late_replies(
                 device.requests[0].answer()
                 assert await plc.read_holding_registers(2, 1) == [2]
                 assert plc.late == 1
+
+    with asyncio.Runner(loop_factory=loop_factory) as runner:
+        runner.run(main())
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has such a limit")
+@pytest.mark.parametrize("loop_factory", [asyncio.new_event_loop, event_loop.fastest])
+def test_the_system_repeats_a_request_only_for_its_timeout(
+    loop_factory: Callable[[], asyncio.AbstractEventLoop], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sockets: list[socket.socket] = []
+
+    async def connected(*arguments: Any) -> socket.socket:
+        sockets.append(await tcp_connect.connected(*arguments))
+        return sockets[-1]
+
+    monkeypatch.setattr(async_transports, "connected", connected)
+
+    def limit_ms() -> int:
+        return sockets[-1].getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+
+    async def main() -> None:
+        with Stream("tcp") as device:
+            plc = holdfast.Client(device.url)
+            # The longest so far, in whole seconds; a new connection begins anew.
+            for timeout, limit in [(30, 30_000), (29.5, 30_000), (30.5, 31_000)]:
+                plc.timeout = timeout
+                await plc.write_register(0, 1)
+                assert limit_ms() == limit
+            await plc.close()
+            plc.timeout = 20
+            await plc.write_register(0, 1)
+            assert limit_ms() == 20_000
+            await plc.close()
 
     with asyncio.Runner(loop_factory=loop_factory) as runner:
         runner.run(main())

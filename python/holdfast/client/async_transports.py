@@ -17,7 +17,7 @@ import socket
 import warnings
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor, wait
-from math import inf
+from math import ceil, inf
 from threading import Event
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
@@ -25,7 +25,7 @@ from holdfast._core import Attempt, BlockingClient, Connection
 from holdfast.client.endpoint import endpoint
 from holdfast.client.fork import renew_in_children
 from holdfast.client.program_end import end_at_exit, sleep_at_end
-from holdfast.client.tcp_connect import addresses, connected
+from holdfast.client.tcp_connect import addresses, connected, limit_resends
 from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
 from holdfast.runtime.text import os_error_text
 
@@ -218,6 +218,8 @@ class AsyncConnection:
                 if here.has_pauses or attempt is not None:
                     now = here.time()
                     left = max(deadline - now, 0.0)
+                if timeout > here.resend_limit_s:
+                    here.cover(timeout)
                 if note_sent is not None:
                     note_sent()
                 try:
@@ -314,6 +316,8 @@ class _LoopConnection:
         self.open: Connection | None = None
         self.closes = 0
         """How often the client was closed: no call from before is sent after that."""
+        self.resend_limit_s = 0
+        """How long the system repeats bytes on the open connection; 0: no request was sent yet."""
         self._max_in_flight = max_in_flight
         self._target = target
         self._endpoint = endpoint
@@ -323,13 +327,21 @@ class _LoopConnection:
         self._longest_late_before = longest_late
         """The late replies of connections that have ended."""
         self._protocol: _Protocol | None = None
-        """The socket of the open connection."""
+        """The transport of the open connection."""
+        self._socket: socket.socket | None = None
         self._newest: Connection | None = None
         """Open or ended: its late replies may come on the next one."""
         self._connecting: asyncio.Task[_Protocol] | None = None
         self._is_looking_up = False
         """Whether the attempt to connect waits, or has waited, for the addresses of the host."""
         self._connect_at = -inf
+
+    def cover(self, timeout: float) -> None:
+        """Called before a request is sent whose timeout is longer than those before it. In whole
+        seconds, as in the core: it seldom changes."""
+        assert self._socket is not None
+        self.resend_limit_s = max(ceil(timeout), 1)
+        limit_resends(self._socket, self.resend_limit_s)
 
     def end(self, connection: Connection) -> None:
         """Ends a connection that can't send any more: it has had its number of requests, or all
@@ -434,8 +446,9 @@ class _LoopConnection:
                     self._is_looking_up = True
                     found = await addresses(target.host, target.port)
                     self._is_looking_up = False
-                    connection = await connected(found, deadline)
-                    await self.loop.create_connection(lambda: protocol, sock=connection)
+                    self._socket = await connected(found, deadline)
+                    self.resend_limit_s = 0
+                    await self.loop.create_connection(lambda: protocol, sock=self._socket)
                 except OSError as error:
                     if isinstance(error, TimeoutError) and error.errno is None:
                         raise  # Of this side, not of the system.

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -61,6 +62,16 @@ def connected_sync(host: str, port: int, deadline: float) -> socket.socket:
             if not others:
                 raise
     raise OSError("the host has no address")
+
+
+def limit_resends(connection: socket.socket, limit_s: int) -> None:
+    """Limits how long the system repeats what the device does not acknowledge, as in the core.
+
+    Without it a write that was given up could arrive minutes later. Only Linux has such a limit.
+    """
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, limit_s * 1000)
 
 
 def _countdown(candidates: Sequence[SocketAddress]) -> Iterator[tuple[int, SocketAddress]]:
