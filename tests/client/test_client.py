@@ -32,7 +32,9 @@ from holdfast._core import BlockingClient, Request
 from holdfast.client import async_transports, tcp_connect
 from holdfast.client import endpoint as endpoints
 from holdfast.client.requests import TooManyValues
-from holdfast.client.url import NetworkTarget, SerialTarget, Tls, Tolerance, parse
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.tolerance import Tolerance
+from holdfast.client.url import NetworkTarget, Tls, parse
 from holdfast.config.text.problems import Problem
 from holdfast.net import event_loop
 from holdfast.polling import WriteFailed

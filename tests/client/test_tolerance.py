@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.client.url import NetworkTarget, Tolerance, in_folder, parse
+from holdfast.client.tolerance import Tolerance
+from holdfast.client.url import NetworkTarget, in_folder, parse
 from support import wire
 from support.faces import FACES, Dial, connected, dialling, run
 from support.fake_device import (

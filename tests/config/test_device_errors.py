@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.client.url import NetworkTarget, Tls, Tolerance
+from holdfast.client.tolerance import Tolerance
+from holdfast.client.url import NetworkTarget, Tls
 from support.config_folder import Folder
 
 if TYPE_CHECKING:

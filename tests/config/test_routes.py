@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.client.url import Tolerance, parse
+from holdfast.client.tolerance import Tolerance
+from holdfast.client.url import parse
 from holdfast.config.models.links import LinkConfig
 from holdfast.config.models.listeners import ModbusTcpListener, RouteConfig, UnitMemoryConfig
 from support.config_folder import Folder

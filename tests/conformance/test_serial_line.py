@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 import holdfast
-from holdfast.client.url import NetworkTarget, SerialTarget, parse
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.url import NetworkTarget, parse
 from holdfast.config import ConfigError, load
 from holdfast.config.models.listeners import AsciiSerialConfig, RtuSerialConfig
 from support.fake_device import Serial

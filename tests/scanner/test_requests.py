@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import jsonschema_rs
 import pytest
 
-from holdfast.client.url import NetworkTarget, SerialTarget
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.url import NetworkTarget
 from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.schema import json_schema

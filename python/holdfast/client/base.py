@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TypeAlias
 
-from holdfast.client.url import SerialTarget, parse
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.url import parse
 from holdfast.protocol import BROADCAST_CODES, MAX_UNIT
 from holdfast.values.integers import as_integer
 

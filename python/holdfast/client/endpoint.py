@@ -6,7 +6,9 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from holdfast._core import Endpoint
-from holdfast.client.url import STRICT, NetworkTarget, SerialTarget
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.tolerance import STRICT
+from holdfast.client.url import NetworkTarget
 from holdfast.protocol import TLS_PORT
 from holdfast.runtime.bounded_files import require_stored
 

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING
 
 from holdfast.client import Client
 from holdfast.client.base import DEFAULT_TIMEOUT_S
-from holdfast.client.url import IN_FLIGHT, NetworkTarget, SerialTarget, parse
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.url import IN_FLIGHT, NetworkTarget, parse
 from holdfast.errors import (
     ConnectionLost,
     InvalidResponse,

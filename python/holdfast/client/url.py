@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from urllib.parse import parse_qsl, unquote, urlsplit
 
+from holdfast.client.serial_settings import Mode, SerialTarget, stop_bits
+from holdfast.client.tolerance import STRICT, Tolerance
 from holdfast.net.addresses import address_in, joined
 from holdfast.net.hosts import host_and_port
 from holdfast.net.tls import NO_FILES
@@ -21,10 +23,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from holdfast.types import Transport
-
-Mode: TypeAlias = Literal["rtu", "ascii"]
-Parity: TypeAlias = Literal["none", "even", "odd"]
-Rs485: TypeAlias = Literal["rts", "rts-low"]
 
 SERIAL = ("rtu", "ascii")
 ALL = (*TRANSPORTS, *SERIAL)
@@ -51,49 +49,6 @@ MAX_CLOSE_AFTER = 65_535
 
 
 @dataclass(frozen=True)
-class Tolerance:
-    """How to treat a device that deviates from the standard. The default follows the standard."""
-
-    accept_unit: int | Literal["any"] | None = None
-    """A unit id that replies may carry besides that of the request, or any."""
-    pad: bool = False
-    """Whether surplus bytes at the end of a reply are ignored. Over TCP and UDP, an exception reply
-    ends after its exception code whatever length its header has.
-    """
-    echo: bool | Literal["auto"] = "auto"
-    """Whether the adapter repeats what is sent; `auto` detects it at reads."""
-    pause: float = 0.0
-    """Seconds between the end of a request and the next; one request is in flight then."""
-    pause_after_connect: float = 0.0
-    """Seconds between connecting and the first request."""
-    retries: int = 0
-    """How often a read is sent again after a timeout, an invalid reply or a lost connection."""
-    retry_busy: bool = False
-    """Whether `retries` covers exceptions 05 and 06 too."""
-    close_after: int = 0
-    """Requests after which the connection is closed, 0 for never; one is in flight then."""
-    reconnect: float = 0.0
-    """Seconds between the end of a connection and the next attempt to connect."""
-    write_multiple: bool = False
-    """Whether one coil is written with function 15 and one register with function 16, for a device
-    without functions 5 and 6.
-    """
-
-    @property
-    def is_one_at_a_time(self) -> bool:
-        """Whether at most one request is in flight, whatever the transport can carry."""
-        return self.pause > 0 or self.close_after > 0
-
-    @property
-    def has_pauses(self) -> bool:
-        """Whether a request may have to wait before it is sent."""
-        return self.pause > 0 or self.pause_after_connect > 0
-
-
-STRICT = Tolerance()
-
-
-@dataclass(frozen=True)
 class NetworkTarget:
     """A device or gateway at a network address."""
 
@@ -108,38 +63,7 @@ class NetworkTarget:
         return f"{self.transport}://{joined(self.host, self.port)}"
 
 
-@dataclass(frozen=True)
-class SerialTarget:
-    """A serial line."""
-
-    mode: Mode
-    device: str
-    baud: int = 19200
-    parity: Parity = "even"
-    stop_bits: int = 1
-    data_bits: int = 8
-    silence: float | None = None
-    """Seconds that end an RTU frame; `None` for 3.5 characters."""
-    tolerance: Tolerance = STRICT
-    rs485: Rs485 | None = None
-    """How the driver switches the direction of an RS-485 line; `None` if the adapter does."""
-
-    def __str__(self) -> str:
-        return f"{self.mode}://{self.device}"
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The settings of the line, as the native core has them."""
-        known = asdict(self)
-        return {key: known[key] for key in known if key not in ("device", "tolerance")}
-
-
 Target: TypeAlias = NetworkTarget | SerialTarget
-
-
-def stop_bits(parity: Parity) -> Literal[1, 2]:
-    """The usual stop bits: characters with and without a parity bit have the same length."""
-    return 2 if parity == "none" else 1
 
 
 def connection_of(target: Target) -> str:

@@ -15,7 +15,7 @@ from holdfast.errors import ConnectFailed
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from holdfast.client.url import Parity
+    from holdfast.client.serial_settings import Parity
 
 LINE_UNITS = tuple(range(1, 11))
 """Unit ids to try on a serial line: each takes a timeout, with each of its settings."""

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Literal, Self, TypeAlias, TypeVar, Unpack, cas
 from urllib.parse import urlsplit
 
 from holdfast import _core
-from holdfast.client.url import SERIAL, STRICT, SerialTarget, parse
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.tolerance import STRICT
+from holdfast.client.url import SERIAL, parse
 from holdfast.net.addresses import LOOPBACK
 from holdfast.protocol import MAX_SERIAL_UNIT, MAX_UNIT
 from holdfast.server.fork import close_in_children

@@ -36,7 +36,8 @@ from holdfast.cli.options.units import refuse_broadcast, unit_ids
 from holdfast.cli.options.url import checked_url
 from holdfast.cli.signals import interruptions
 from holdfast.cli.terminal_text import number_ranges
-from holdfast.client.url import SerialTarget, parse
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.url import parse
 from holdfast.config.tag_files.read import KINDS, MAX_BYTES
 from holdfast.config.tag_files.write import tags_as_csv, tags_as_yaml
 from holdfast.discovery import description, device_search

@@ -19,7 +19,8 @@ from holdfast.cli.options.duration import Duration, time_option, timeout_option
 from holdfast.cli.options.option import DecimalNumber, flag, json_option, number_option, option
 from holdfast.cli.options.units import unit_ids
 from holdfast.cli.options.url import checked_url, is_serial_device
-from holdfast.client.url import SerialTarget, parse
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.url import parse
 from holdfast.config.values.ip_addresses import parse_source
 from holdfast.discovery import device_search
 from holdfast.discovery.line_search import BAUDS, PARITIES
@@ -29,7 +30,7 @@ from holdfast.protocol import MAX_SERIAL_UNIT, PORT
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from holdfast.client.url import Parity
+    from holdfast.client.serial_settings import Parity
     from holdfast.net.addresses import Network
 
 LINE_TIMEOUT_S = 0.5

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from holdfast.cli.devices.search_report import Ended
-    from holdfast.client.url import Parity
+    from holdfast.client.serial_settings import Parity
     from holdfast.discovery.line_search import Attempt
 
 

@@ -14,7 +14,8 @@ from holdfast.cli.options import device
 from holdfast.cli.options.units import refuse_broadcast
 from holdfast.cli.signals import interruptions
 from holdfast.cli.terminal_text import number_ranges
-from holdfast.client.url import SerialTarget, parse
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.url import parse
 from holdfast.discovery import device_search
 
 if TYPE_CHECKING:

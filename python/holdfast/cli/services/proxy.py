@@ -15,7 +15,8 @@ from holdfast.cli.options.option import choice, option, parsed_by
 from holdfast.cli.options.url import checked_url
 from holdfast.cli.services.run import serve
 from holdfast.client.endpoint import endpoint
-from holdfast.client.url import SerialTarget, parse
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.url import parse
 from holdfast.config import Config
 from holdfast.config.values.scalars import MAX_TIME, MIN_TIME
 from holdfast.net.addresses import LOOPBACK, joined, reachable

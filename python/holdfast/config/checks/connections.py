@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.client.url import STRICT, SerialTarget, Tolerance, parse, parse_receiver
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.tolerance import STRICT, Tolerance
+from holdfast.client.url import parse, parse_receiver
 from holdfast.config.checks.common import check_readable, given, items, until_invalid
 from holdfast.config.models.devices import DeviceConfig, RetryConfig, tolerating
 from holdfast.config.models.listeners import (

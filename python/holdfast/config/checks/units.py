@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, TypeAlias
 
-from holdfast.client.url import SerialTarget
+from holdfast.client.serial_settings import SerialTarget
 from holdfast.config.checks.common import given, items, refuse_repeats, until_invalid
 from holdfast.config.checks.memories import area_of, check_memory
 from holdfast.config.models.base import INVALID

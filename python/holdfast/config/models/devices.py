@@ -9,6 +9,7 @@ from pydantic import AfterValidator, ConfigDict, Field, Strict, ValidationInfo, 
 
 from holdfast._core import MAX_IN_FLIGHT, RETRY_PAUSES_S
 from holdfast.client.base import DEFAULT_TIMEOUT_S, MAX_INTERVAL_S, MIN_INTERVAL_S
+from holdfast.client.tolerance import Tolerance
 from holdfast.client.url import (
     MAX_CLOSE_AFTER,
     MAX_PAUSE_S,
@@ -16,7 +17,6 @@ from holdfast.client.url import (
     RECEIVER_TIMEOUT_S,
     Receiver,
     Target,
-    Tolerance,
     parse,
     parse_receiver,
 )

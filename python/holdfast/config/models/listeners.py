@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Discriminator, Field, Strict, Tag
 
-from holdfast.client.url import Parity, Rs485, SerialTarget, stop_bits
+from holdfast.client.serial_settings import Parity, Rs485, SerialTarget, stop_bits
 from holdfast.config.models.base import Model
 from holdfast.config.models.connection_limits import ConnectionLimits
 from holdfast.config.models.devices import RangeConfig

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, unquote, urlencode, urlsplit
 
-from holdfast.client.url import MAX_PAUSE_S, MAX_RETRIES, SerialTarget, connection_of, parse
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.url import MAX_PAUSE_S, MAX_RETRIES, connection_of, parse
 from holdfast.config.text.messages import show
 from holdfast.config.values.scalars import MIN_TIME
 from holdfast.importing.telegraf.durations import interval, seconds

@@ -6,7 +6,8 @@ from dataclasses import replace
 from ipaddress import ip_network
 from typing import TYPE_CHECKING
 
-from holdfast.client.url import NetworkTarget, SerialTarget
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.url import NetworkTarget
 from holdfast.net.addresses import certificate_name
 from holdfast.net.allow_list import ALL_PORTS, AllowedNetwork, AllowList, NotAllowed
 from holdfast.net.resolver import NoSuchName, Resolver

@@ -10,7 +10,8 @@ import os
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
-from holdfast.client.url import STRICT, SerialTarget
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.tolerance import STRICT
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.subject_parts import subject_id
 from holdfast.scanner.subscriptions.subscription import SETTINGS

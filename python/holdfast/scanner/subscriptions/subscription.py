@@ -10,7 +10,9 @@ import msgspec
 
 from holdfast import tags
 from holdfast.client import url as urls
-from holdfast.client.url import STRICT, NetworkTarget, SerialTarget
+from holdfast.client.serial_settings import SerialTarget
+from holdfast.client.tolerance import STRICT
+from holdfast.client.url import NetworkTarget
 from holdfast.net.addresses import address_in, unbracketed
 from holdfast.net.hosts import HOST_FORM, is_host
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS, usual_port
