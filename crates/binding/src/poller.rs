@@ -8,8 +8,8 @@ use holdfast_engine::client::Place;
 use holdfast_engine::link::Fault;
 use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
-    self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll,
-    Polled, Poller as Core, PollerError, ReadSettings, StatusSettings,
+    self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, FIRST_POLL_SPREAD,
+    ForwardSettings, Poll, Polled, Poller as Core, PollerError, ReadSettings, StatusSettings,
 };
 use holdfast_memory::Refusal;
 use holdfast_protocol::pdu::limit;
@@ -111,7 +111,10 @@ impl PolledDevice {
             strategy: strategy(max_gap, cost)?,
             forward: forward.collect::<PyResult<_>>()?,
             status: status.transpose()?,
-            start_within: seconds("start_within", start_within.unwrap_or(interval))?,
+            start_within: match start_within {
+                Some(within) => seconds("start_within", within)?,
+                None => FIRST_POLL_SPREAD.min(seconds("interval", interval)?),
+            },
             report: report.map(|receiver| Arc::clone(&receiver.core)),
             release,
             measured,

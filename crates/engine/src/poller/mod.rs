@@ -32,6 +32,7 @@ pub use device::DeviceSettings;
 pub use forwarding::{ForwardCounters, ForwardFailure, ForwardSettings};
 pub use mirror_age::MirrorAge;
 pub use results::{Batch, BlockResult, Poll, Results, Written};
+pub use schedule::FIRST_POLL_SPREAD;
 pub use state::{DeviceCounters, DeviceState};
 pub use status::{BlockSettings, StatusSettings};
 pub use thread::{Polled, Poller, PollerError};

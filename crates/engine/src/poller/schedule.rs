@@ -88,6 +88,9 @@ impl Schedule {
     }
 }
 
+/// The first polls of devices are spread over their interval, or over this if that is less.
+pub const FIRST_POLL_SPREAD: Duration = Duration::from_secs(10);
+
 /// When the device with this number is polled first, after the start: the golden ratio spreads any number
 /// of devices evenly.
 pub(super) fn first_poll(within: Duration, number: u32) -> Duration {

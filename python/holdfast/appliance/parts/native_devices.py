@@ -27,9 +27,6 @@ if TYPE_CHECKING:
     )
     from holdfast.types import Area, Forward, StatusBlock
 
-FIRST_POLL_SPREAD_S = 10.0
-"""The time over which the first polls of devices are spread; at most the polling interval."""
-
 
 def device(
     name: str,
@@ -63,7 +60,6 @@ def device(
             for index, each in enumerate(settings.forward)
         ],
         status=None if status is None else (memories[status.memory], _block(name, status)),
-        start_within=min(settings.interval, FIRST_POLL_SPREAD_S),
         in_flight=None if settings.in_flight == "auto" else settings.in_flight,
         retry=settings.retry.pauses,
         measured=settings.max_gap == "auto",
