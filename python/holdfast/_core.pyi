@@ -1320,12 +1320,13 @@ class PolledDevice:
     and address, and the age of its values or `None`. `max_gap` (default: 0) or `cost` (of a
     request, of a register or 16 bits) selects the gaps that are read; `readable` and `forbidden`
     are areas with start and end, exclusive. `status` is the memory of the status block, and the
-    block. `start_within` is the maximum delay of the first poll (default: the interval, at most
-    10 s). `report` takes the polls; `fields` are areas, addresses and counts that are read only for
-    it, and not forwarded. `release` closes the connection after each poll. With `measured`, measurements
-    replace `cost` after a while. `retry` are the first and the longest pause after failures
-    (default: `RETRY_PAUSES_S`). With `jitter`, they are up to a quarter shorter, and the device is
-    retried at the next time of its schedule; without, when they end. With a `fence`, the device is
+    block. `start_within` is the maximum delay of the first poll (default: the interval, at most 10
+    s). `report` takes the polls; `fields` are areas, addresses and counts that are read only for
+    it, and not forwarded. `release` closes the connection after each poll. With `measured`,
+    measurements replace `cost` after a while. `retry` are the first and the longest pause after
+    failures (default: `RETRY_PAUSES_S`). With `jitter`, they are up to a quarter shorter, and the
+    device is retried at the next time of its schedule; without, when they end. With a `fence`, the
+    device is
     polled and written to while that is open; devices of one link have the same. Times are in
     seconds; interval 0 polls without a pause.
     """
