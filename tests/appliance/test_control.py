@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import errno
 import os
+import socket
 import sys
 import tempfile
 import threading
+from contextlib import ExitStack, suppress
 from functools import partial
 from multiprocessing.connection import Listener
 from pathlib import Path
@@ -70,22 +72,42 @@ def test_it_pauses_after_an_error_and_a_stop_ends_the_pause(
     for pause in ("FIRST_PAUSE_S", "MAX_PAUSE_S"):
         monkeypatch.setattr(control, pause, 3600.0)
     before = set(threading.enumerate())
-    socket = Control(FILE, {})
+    running = Control(FILE, {})
     [thread] = set(threading.enumerate()) - before
     wire.until(lambda: accepting.calls, "the first attempt")
-    socket.close()
+    running.close()
     assert not thread.is_alive()
     assert accepting.calls == 1
 
 
 def test_it_answers_again_after_errors(accepting: Accepting) -> None:
     accepting.failures = 2
-    socket = Control(FILE, {})
+    running = Control(FILE, {})
     try:
         assert pinged(FILE)
         assert accepting.calls > accepting.failures
     finally:
-        socket.close()
+        running.close()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no callers that wait")
+def test_callers_that_nobody_accepts_hold_up_neither_another_start_nor_a_stop(
+    runtime: Path, accepting: Accepting, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    accepting.failures = 1_000_000
+    monkeypatch.setattr(control, "FIRST_PAUSE_S", 3600.0)
+    monkeypatch.setattr(control, "MAX_PAUSE_S", 3600.0)
+    with ExitStack() as callers:
+        running = Control(FILE, {})
+        with suppress(BlockingIOError):
+            while True:  # Until no more may wait.
+                caller = callers.enter_context(socket.socket(socket.AF_UNIX))
+                caller.setblocking(False)
+                caller.connect(str(*runtime.iterdir()))
+        with pytest.raises(OSError, match="in use"):
+            Control(FILE, {})
+        running.close()
+    assert not list(runtime.iterdir())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs symbolic links")
@@ -101,7 +123,7 @@ def test_it_is_found_by_its_path_when_a_symbolic_link_on_the_way_is_replaced(
     link.symlink_to(first)
     file = link / "plant.yaml"
     other.symlink_to(first / "plant.yaml")
-    socket = Control(file, {})
+    running = Control(file, {})
     try:
         # Also by another path to the same file.
         assert [pinged(each) for each in (file, first / "plant.yaml", other)] == [True] * 3
@@ -110,7 +132,7 @@ def test_it_is_found_by_its_path_when_a_symbolic_link_on_the_way_is_replaced(
         assert pinged(file)
         assert not pinged(second / "plant.yaml")
     finally:
-        socket.close()
+        running.close()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs symbolic links")
@@ -126,8 +148,8 @@ def test_of_two_appliances_each_is_found_by_the_path_that_it_was_started_with(
         for each in (file, link):
             assert control.ask(each, "path")["name"] == each.name
     finally:
-        for socket in sockets:
-            socket.close()
+        for running in sockets:
+            running.close()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="pipes have no folders")
@@ -151,7 +173,7 @@ def test_root_finds_appliances_of_others_in_folders_that_only_they_can_make(
     monkeypatch.setattr(control, "RUN", runtime / "run")
     monkeypatch.setattr(tempfile, "tempdir", str(runtime / "tmp"))
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(made))
-    socket = Control(FILE, {})
+    running = Control(FILE, {})
     monkeypatch.delenv("RUNTIME_DIRECTORY")
     try:
         monkeypatch.setattr(control, "_user", lambda: user + 2)
@@ -159,4 +181,4 @@ def test_root_finds_appliances_of_others_in_folders_that_only_they_can_make(
         monkeypatch.setattr(control, "_user", lambda: 0)
         assert pinged(FILE) == is_found
     finally:
-        socket.close()
+        running.close()

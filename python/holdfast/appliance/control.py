@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import json
 import os
+import socket
 import sys
 import tempfile
 import threading
@@ -78,8 +79,7 @@ class Control:
         """Frees the sockets."""
         self._closed.set()
         for address in self._listeners:
-            with contextlib.suppress(OSError, EOFError), Client(address):
-                pass  # Wakes the thread.
+            _is_alive(address)  # Wakes the thread. So do callers that it has not accepted yet.
         for thread in self._threads:
             thread.join(TIMEOUT_S)
         for listener in self._listeners.values():
@@ -183,10 +183,20 @@ def _listen(address: str) -> Listener:
 
 
 def _is_alive(address: str) -> bool:
-    found = _connected(address)
-    if found is not None:
-        found.close()
-    return found is not None
+    """Connects, without waiting. Returns whether somebody listens there."""
+    if sys.platform == "win32":
+        with contextlib.suppress(OSError), Client(address):
+            return True
+        return False
+    try:
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.setblocking(False)
+            connection.connect(address)
+    except BlockingIOError:
+        return True  # As many callers as may wait do: one more would wait until one is accepted.
+    except OSError:
+        return False
+    return True
 
 
 def _connected(address: str) -> Any:  # A connection, of another type on Windows; or None.
