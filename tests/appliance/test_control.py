@@ -90,6 +90,25 @@ def test_it_answers_again_after_errors(accepting: Accepting) -> None:
         running.close()
 
 
+@pytest.mark.usefixtures("runtime")
+def test_it_answers_although_no_thread_can_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    start = threading.Thread.start
+
+    def started(thread: threading.Thread) -> None:
+        if thread.name == "holdfast-control":
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    running = Control(FILE, {})
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(threading.Thread, "start", started)
+            assert [pinged(FILE), pinged(FILE)] == [True, True]
+        assert pinged(FILE)
+    finally:
+        running.close()
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have no callers that wait")
 def test_callers_that_nobody_accepts_hold_up_neither_another_start_nor_a_stop(
     runtime: Path, accepting: Accepting, monkeypatch: pytest.MonkeyPatch

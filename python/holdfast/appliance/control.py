@@ -22,7 +22,6 @@ from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
-    from multiprocessing.connection import Connection
 
     Handler = Callable[..., Mapping[str, Any]]
 
@@ -94,11 +93,15 @@ class Control:
                 self._closed.wait(backoff.failed())
                 continue
             backoff.succeeded()
-            threading.Thread(
+            serving = threading.Thread(
                 target=self._serve, args=(connection,), name="holdfast-control", daemon=True
-            ).start()
+            )
+            try:
+                serving.start()
+            except RuntimeError:  # No new thread can start. Meanwhile, callers wait for each other.
+                self._serve(connection)
 
-    def _serve(self, connection: Connection) -> None:
+    def _serve(self, connection: Any) -> None:  # A connection, of another type on Windows.
         with contextlib.suppress(OSError, EOFError), connection:
             if not connection.poll(TIMEOUT_S):
                 return
