@@ -91,6 +91,16 @@ def test_it_answers_again_after_errors(accepting: Accepting) -> None:
 
 
 @pytest.mark.usefixtures("runtime")
+def test_a_path_need_not_be_utf_8() -> None:
+    file = Path("pl\udce9.yaml")  # As Python has a name with the byte E9.
+    running = Control(file, {})
+    try:
+        assert pinged(file)
+    finally:
+        running.close()
+
+
+@pytest.mark.usefixtures("runtime")
 def test_it_answers_although_no_thread_can_start(monkeypatch: pytest.MonkeyPatch) -> None:
     start = threading.Thread.start
 

@@ -291,7 +291,7 @@ def _names(file: Path) -> list[str]:
     started with another path to the same file.
     """
     paths = dict.fromkeys((os.path.normpath(file.absolute()), str(file.resolve())))
-    digests = [hashlib.sha256(path.encode()).hexdigest()[:16] for path in paths]
+    digests = [hashlib.sha256(os.fsencode(path)).hexdigest()[:16] for path in paths]
     if sys.platform == "win32":
         return [rf"\\.\pipe\holdfast-{digest}" for digest in digests]
     return [f"{digest}.sock" for digest in digests]
