@@ -6,6 +6,7 @@ import errno
 import json
 import logging
 import os
+import sys
 import threading
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,17 @@ def test_lines_arrive_in_order(pipe: tuple[int, Any]) -> None:
     handler.flush()
     expected = "".join(f"{number} °C\n" for number in range(100))
     assert os.read(reader, 65536).decode() == expected
+
+
+def test_a_console_of_windows_gets_its_own_encoding(
+    pipe: tuple[int, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader, stream = pipe
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.setattr(os, "device_encoding", lambda _: "cp850")
+    handler = QueuedHandler(stream)
+    logged(handler, "20 °C Ω")
+    assert os.read(reader, 65536) == b"20 \xf8C \\u03a9\n"
 
 
 def test_a_reader_that_stops_loses_the_newest_lines_which_are_counted(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
@@ -109,6 +110,31 @@ def test_a_service_runs_although_nobody_can_read_its_greeting() -> None:
     finally:
         running.kill()
         running.wait()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="its pipes can't be filled without waiting")
+def test_a_service_runs_although_nobody_reads_its_greeting(tmp_path: Path) -> None:
+    config = tmp_path / "plant.yaml"
+    rule = "sources: [127.0.0.0/8], units: {1: plant}, access: read-only"
+    listener = f"type: modbus-tcp, bind: 127.0.0.1:0, rules: [{{{rule}}}]"
+    config.write_text(f"memories: {{plant: {{coils: 1}}}}\nlisteners: {{scada: {{{listener}}}}}")
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(writer, b"x")
+    os.set_blocking(writer, True)
+    running = subprocess.Popen([*HOLDFAST, "run", str(config)], stdout=writer)
+    try:
+        # A reload is what the main thread does behind the greeting.
+        wire.until(lambda: cli.invoke("reload", str(config)).exit_code == 0, "it takes requests")
+        running.send_signal(signal.SIGTERM)
+        assert running.wait(wire.DEADLINE) == 0
+    finally:
+        running.kill()
+        running.wait()
+        os.close(reader)
+        os.close(writer)
 
 
 def test_text_of_a_device_that_the_encoding_does_not_have_is_escaped() -> None:

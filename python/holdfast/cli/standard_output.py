@@ -1,16 +1,17 @@
 """Standard output that can't take what a command prints: another encoding, a full disk, a reader
-that is gone, a stream that is closed.
+that is gone or does not read, a stream that is closed.
 """
 
 from __future__ import annotations
 
 import errno
 import io
+import logging
 import os
 import sys
 from pathlib import Path
 
-import click
+from holdfast.events.writer import QueuedHandler
 
 _UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EPIPE)
 
@@ -67,10 +68,7 @@ def leave() -> None:
 
 
 def announce(text: str) -> None:
-    """Prints what a service says at its start. A service runs, whoever reads that."""
-    try:
-        click.echo(text)
-    except OSError as error:
-        if not is_unwritable(error):
-            raise
-        leave()
+    """Prints what a service says at its start. A service runs, whoever reads that, and when."""
+    printing = QueuedHandler(sys.stdout)
+    printing.emit(logging.makeLogRecord({"msg": text}))
+    printing.flush()  # Whoever reads has it before the service goes on.

@@ -1,10 +1,13 @@
-"""Writes log lines from a thread of its own, so that a reader who stops reading holds up nobody."""
+"""Writes log lines, and what services print at their start, from a thread of its own, so that a
+reader who stops reading holds up nobody.
+"""
 
 from __future__ import annotations
 
 import logging
 import os
 import select
+import sys
 import threading
 import time
 from collections import deque
@@ -102,7 +105,10 @@ class QueuedHandler(logging.Handler):
             return 0
         if self._ends_in_line:
             text = "\n" + text
-        data = text.encode(self._stream.encoding or "utf-8", "backslashreplace")
+        encoding = self._stream.encoding or "utf-8"
+        if sys.platform == "win32":  # A console takes bytes in an encoding of its own.
+            encoding = os.device_encoding(descriptor) or encoding
+        data = text.encode(encoding, "backslashreplace")
         while data:
             try:
                 count = os.write(descriptor, data)
