@@ -176,6 +176,33 @@ def test_a_file_that_was_renamed_by_others_is_created_anew(log: Path, *, reopens
     assert reasons(log) == []
 
 
+def test_a_file_that_others_put_back_says_so(log: Path) -> None:
+    audit = opened(log)
+    audit.write(number=1)
+    aside = log.rename(log.with_name("aside.log"))
+    audit.write(number=2)
+    other = log.rename(log.with_name("other.log"))
+    aside.rename(log)
+    audit.write(number=3)
+    audit.close()
+    assert (numbers(log), reasons(log), numbers(other)) == ([1, 3], ["new", "changed"], [2])
+    for file in (log, other):
+        assert verify([file]).error is None
+    assert verify([log]).breaks == {"changed": 1}
+
+
+def test_a_file_that_was_out_of_reach_goes_on(log: Path) -> None:
+    audit = opened(log)
+    audit.write(number=1)
+    folder = log.parent.rename(log.parent.with_name("unmounted"))
+    audit.write(number=2)
+    folder.rename(log.parent)
+    audit.write(number=3)
+    audit.close()
+    assert (numbers(log), reasons(log)) == ([1, 3], ["new"])
+    assert verify([log]).lost == 1
+
+
 def test_a_deleted_file_begins_with_a_line_that_says_so(log: Path) -> None:
     audit = opened(log)
     audit.write(number=1)

@@ -22,7 +22,7 @@ BREAK = "chain"
 `new` (no line before is known), `missing` (the file was missing or empty at the start), `torn` (the
 last line was incomplete; `after` is the digest of the line before that one), `unchained` (the last
 line had no place in a chain), `deleted` (the file was deleted while it was written), `changed`
-(something else changed the size of the file)."""
+(something else changed the size of the file, or put another one in its place)."""
 
 
 encoded = msgspec.json.Encoder().encode

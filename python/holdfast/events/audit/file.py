@@ -41,6 +41,7 @@ class AuditFile:
         self._prefix = b""
         self._descriptor = CLOSED
         self._identity: tuple[int, int] | None = None
+        """That of the file that was written last."""
         self._is_regular = False
         self._size = 0
         self._open()
@@ -53,7 +54,7 @@ class AuditFile:
 
     def close(self) -> None:
         """Closes the file."""
-        descriptor, self._descriptor, self._identity = self._descriptor, CLOSED, None
+        descriptor, self._descriptor = self._descriptor, CLOSED
         if descriptor != CLOSED:
             os.close(descriptor)
 
@@ -63,15 +64,20 @@ class AuditFile:
             status = self.file.stat()
         except OSError:
             status = None
-        if status is not None and _identity(status) == self._identity:
+        is_open = self._descriptor != CLOSED
+        if is_open and status is not None and _identity(status) == self._identity:
             if self._is_regular and status.st_size != self._size:
                 self.broken, self._size = {"reason": "changed"}, status.st_size
                 self._end_last_line()
             return
-        if self._is_regular and self._descriptor != CLOSED and not _links(self._descriptor):
+        if self._is_regular and is_open and not _links(self._descriptor):
             self.broken = {"reason": "deleted"}
+        before = self._identity, self._size
         self.close()
         self._open()
+        # An earlier file may be back, without the lines of the one that was here meanwhile.
+        if self.broken is None and self._size and (self._identity, self._size) != before:
+            self.broken = {"reason": "changed"}
         self._end_last_line()
 
     def append(self, lines: list[bytes], *, together: bool = False) -> Iterator[int]:
@@ -113,12 +119,12 @@ class AuditFile:
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_BINARY", 0)
         self._descriptor = os.open(self.file, flags, FILE_MODE)
         status = os.fstat(self._descriptor)
-        self._identity = _identity(status)
-        self._size = status.st_size
         self._is_regular = stat.S_ISREG(status.st_mode)
         if self._is_regular and not lock(self._descriptor):
             self.close()
             raise OSError(f"{self.file}: another process writes this audit log")
+        self._identity = _identity(status)
+        self._size = status.st_size
 
     def _fitting(self, lines: list[bytes]) -> int:
         """The number of lines that fit into the open file."""
