@@ -141,6 +141,7 @@ def test_an_address_in_use_is_told(simulate: Callable[..., tuple[ServingCommand,
         assert result.exit_code == 1
         assert result.stderr.startswith(f"holdfast: can't listen on 127.0.0.1:{port}: Address ")
         assert result.stderr.count("can't listen") == result.stderr.count(port) == 1
+        assert result.stderr.endswith("; --bind sets another address or port\n")
 
 
 @pytest.mark.parametrize(

@@ -130,7 +130,7 @@ def simulate(
         try:
             where = _serve(running, simulated, bind, unit, sources or LOOPBACK, faults, seed)
         except OSError as error:
-            fail(f"{unbindable(bind, error)}; --bind sets another port")
+            fail(f"{unbindable(bind, error)}; --bind sets another address or port")
         standard_output.announce(_greeting(file, profile, tags, where, unit))
 
         def wait(seconds: float) -> None:
