@@ -1,4 +1,4 @@
-"""The lock of an audit log: only one process at a time writes a file."""
+"""The lock of an audit log, or of an output: only one process at a time writes a file."""
 
 from __future__ import annotations
 
