@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sqlite3
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -271,6 +273,21 @@ def test_a_file_that_is_no_database_is_an_error(opened: Opened, tmp_path: Path) 
     (tmp_path / "b.db").write_bytes(b"not a database" * 100)
     with pytest.raises(OSError, match=r"b\.db: file is not a database"):
         opened(tmp_path / "b.db")
+
+
+def test_a_file_of_a_later_version_is_an_error_and_stays_as_it_is(
+    opened: Opened, tmp_path: Path
+) -> None:
+    file = tmp_path / "buffer.db"
+    stored = opened(file)
+    stored.add([numbered(1)])
+    stored.close()
+    with closing(sqlite3.connect(file)) as later:
+        later.execute("PRAGMA user_version=1")
+    before = file.read_bytes()
+    with pytest.raises(OSError, match=r"\.db: format 1, of a later version of Holdfast, all"):
+        opened(file)
+    assert file.read_bytes() == before
 
 
 def damage(file: Path, page: int) -> None:

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
     FindTag = Callable[[str, str], Tag | None]
 
+FORMAT = 0
+"""The version of the format, in each file. Files of a later one are not touched."""
+
 LOCK_TIMEOUT_S = 1.0
 """Seconds to wait for a file that is in use, by default."""
 
@@ -71,6 +74,11 @@ class Stored:
             self._db.text_factory = bytes
             # Two processes with one file would each send the readings of the other.
             self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
+            [found] = self._db.execute("PRAGMA user_version").fetchone()
+            if found > FORMAT:
+                raise sqlite3.NotSupportedError(
+                    f"format {found}, of a later version of Holdfast, allowed: {FORMAT}"
+                )
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
             self._db.executescript(_CREATE)
             self._recount()
