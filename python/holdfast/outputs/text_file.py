@@ -12,7 +12,7 @@ import msgspec
 
 from holdfast.config.models.outputs import MEASUREMENT
 from holdfast.events import log_lines
-from holdfast.events.audit.lock import lock
+from holdfast.events.file_lock import lock
 from holdfast.events.rotation import Rotation
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.sending import Receiver

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
 from holdfast.events.audit.chain import End, digest_of, place_of
-from holdfast.events.audit.lock import lock
+from holdfast.events.file_lock import lock
 from holdfast.events.rotation import Rotation
 
 if TYPE_CHECKING:

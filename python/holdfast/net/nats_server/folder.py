@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from holdfast.events.audit.lock import lock
+from holdfast.events.file_lock import lock
 from holdfast.net.certificates.files import SECRET, replace
 from holdfast.net.nats_server.storage_limit import possible_limit
 from holdfast.net.secret_file import read_secret

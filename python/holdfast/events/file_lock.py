@@ -1,4 +1,4 @@
-"""The lock of an audit log, or of an output: only one process at a time writes a file."""
+"""The lock of a file: one process at a time writes an audit log, an output or a NATS store."""
 
 from __future__ import annotations
 
