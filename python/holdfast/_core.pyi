@@ -1554,9 +1554,9 @@ class Poller:
         """Sends a write to a device over its own connection, between two reads.
 
         Returns the number under which `to` has the result. What can't be sent `within` seconds,
-        and one timeout of the device, is not sent any more: its fault is `expired`. Raises
-        `ValueError` for an unknown device or a request that does not write, `RuntimeError` after
-        `stop`.
+        and one timeout of the device, or waits through a standstill, is not sent any more: its
+        fault is `expired`. Raises `ValueError` for an unknown device or a request that does not
+        write, `RuntimeError` after `stop`.
         """
 
     def link(

@@ -285,8 +285,7 @@ def test_a_command_that_waited_for_long_for_its_device_is_refused(
             go_on.set()
         assert refused == {
             "success": False,
-            "error": "not written: the device was busy for too long; "
-            "send it again if it is still wanted",
+            "error": "not written: it has waited too long; send it again if it is still wanted",
         }
         assert caller.request("modbus.command.a", "4") == {"success": True}
         assert [pdu for pdu in line.asked if pdu[0] == 6] == [bytes.fromhex("0600000004")]

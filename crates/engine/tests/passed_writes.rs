@@ -1,20 +1,21 @@
-//! Writes that are passed on to a device: before a memory whose journal is slow, and during a reload.
+//! Writes that are passed on to a device: before a memory whose journal is slow, during a reload, and after a standstill.
 
 use std::io::{Read as _, Write as _};
 use std::net::{SocketAddr, TcpListener};
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use holdfast_engine::client::Place;
-use holdfast_engine::link::InFlight;
+use holdfast_engine::link::{Caller, InFlight, LinkSettings};
 use holdfast_engine::poller::plan::{PlanLimits, Strategy};
 use holdfast_engine::poller::{
     Destination, DeviceSettings, Passage, PassedRange, Poller, ReadSettings,
 };
 use holdfast_memory::{Access, Area, Done, Journal, Layout, Memory, Read, Span, Step};
-use holdfast_protocol::pdu::Request;
+use holdfast_protocol::client::MAX_READ_DELAY;
+use holdfast_protocol::pdu::{EncodedRequest, Range, Request};
 use holdfast_runtime::Retry;
 
 const AREA: Area = Area::HoldingRegisters;
@@ -211,4 +212,83 @@ fn a_write_to_a_range_that_has_moved_is_not_sent() {
     moved.reads[0].into.as_mut().unwrap().address = 5;
     poller.replace("meter", moved, false).unwrap();
     assert_eq!(written(before).recv_timeout(TIMEOUT), Ok(Err(0x0A)));
+}
+
+/// Hands all steps to the test, and keeps the thread that submits one until the test goes on.
+#[derive(Debug)]
+struct Holding(Manual, Mutex<Receiver<()>>);
+
+impl Journal for Holding {
+    fn submit(&self, step: Step, done: Done) {
+        self.0.submit(step, done);
+        self.1.lock().unwrap().recv_timeout(TIMEOUT).unwrap();
+    }
+}
+
+#[test]
+fn a_write_that_waits_through_a_standstill_is_not_sent() {
+    let memory = memory();
+    let ((sender, steps), (goes_on, held)) = (channel(), channel());
+    memory.keep_in(Arc::new(Holding(Manual(Mutex::new(sender)), Mutex::new(held))), 0);
+    let carry_out = |time: Duration| {
+        let Waiting(step, done) = steps.recv_timeout(TIMEOUT).expect("the journal has a step");
+        let began = Instant::now();
+        while began.elapsed() < time {
+            thread::yield_now();
+        }
+        done(Ok(step.carry_out(std::slice::from_ref(&memory)).unwrap()));
+        goes_on.send(()).unwrap();
+    };
+    let (asks, asked) = channel();
+    let (answers, answer) = channel();
+    let address = device(move || {
+        asks.send(()).unwrap();
+        answer.recv_timeout(TIMEOUT).unwrap();
+    });
+    let settings = settings("meter", address, &memory);
+    let poller = Poller::start(vec![settings.clone()]).unwrap();
+    carry_out(Duration::ZERO);
+
+    let passage = passage(&poller, "meter", &memory);
+    let link = poller.link(LinkSettings {
+        endpoint: settings.endpoint,
+        in_flight: settings.in_flight,
+        retry: settings.retry,
+        queue: LinkSettings::QUEUE,
+        coalesce: true,
+        cache: Duration::ZERO,
+        preferred: Vec::new(),
+    });
+    let link = link.unwrap();
+    let (caller, _wakes) = Caller::new().unwrap();
+    let write = Request::WriteSingleRegister { address: 3, value: 7 };
+    let read = Request::ReadHoldingRegisters(Range::new(0, 5).unwrap());
+    let call = |request: &Request<'_>| {
+        link.call(&caller, 1, &EncodedRequest::new(request), TIMEOUT, false).unwrap()
+    };
+    let sent = passage.call(&caller, &write);
+    asked.recv_timeout(TIMEOUT).expect("the device has the write");
+    let waiting = [passage.call(&caller, &write), call(&write), call(&read)];
+    answers.send(()).unwrap();
+    // The thread of the poller waits for its journal.
+    carry_out(MAX_READ_DELAY * 3 / 2);
+
+    let began = Instant::now();
+    let mut ended = Vec::new();
+    while ended.len() < 4 {
+        assert!(began.elapsed() < TIMEOUT, "{ended:?}");
+        ended.extend(caller.take());
+        thread::yield_now();
+    }
+    let outcome = |ticket| {
+        let call = ended.iter().find(|call| call.ticket == ticket).unwrap();
+        let error = call.outcome.as_ref().err().map(ToString::to_string);
+        (call.is_sent, error.as_deref().unwrap_or("done").to_owned())
+    };
+    assert_eq!(outcome(sent), (true, "done".into()));
+    assert_eq!(outcome(waiting[0]), (false, "exception 0x0a".into()));
+    assert_eq!(outcome(waiting[1]), (false, "not sent: it has waited too long".into()));
+    assert_eq!(outcome(waiting[2]), (true, "done".into()), "a read");
+    assert_eq!(link.counters.withdrawn.get(), 1);
+    assert!(asked.try_recv().is_err(), "the device has another write");
 }

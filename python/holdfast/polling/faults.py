@@ -29,7 +29,7 @@ _TEXTS = {
     FAULTS["internal error"]: "an internal error",
     FAULTS["flooded"]: "a flood of data that was not requested",
     STANDBY: "another node uses the device",
-    EXPIRED: "the device was busy for too long",
+    EXPIRED: "it has waited too long",
 }
 
 

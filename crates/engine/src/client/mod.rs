@@ -60,7 +60,7 @@ pub enum ClientError {
     #[error("another node uses the device")]
     Fenced,
     /// The request was not sent in time. Nothing was sent.
-    #[error("it has waited too long")]
+    #[error("not sent: it has waited too long")]
     Expired,
 }
 

@@ -55,7 +55,7 @@ faults! {
     Flooded = 8, "flooded";
     /// Another node uses the device. Nothing was sent.
     Standby = 9, "standby";
-    /// A write that waited too long: its caller no longer expects it. Nothing was sent.
+    /// A write that waited too long, or through a standstill: its caller may no longer expect it. Nothing was sent.
     Expired = 10, "expired";
     /// There is no way to the host, or nothing has its name. Nothing was sent.
     Unreachable = 11, "unreachable";
@@ -83,7 +83,7 @@ pub(crate) fn exception_code(error: &ClientError) -> u8 {
             | ClientError::LookupTimeout { .. },
             _,
         )
-        | (_, Fault::Refused | Fault::Unreachable | Fault::Standby) => {
+        | (_, Fault::Refused | Fault::Unreachable | Fault::Standby | Fault::Expired) => {
             ExceptionCode::GatewayPathUnavailable.code()
         }
         _ => ExceptionCode::GatewayTargetFailedToRespond.code(),
@@ -188,6 +188,7 @@ mod tests {
             (ClientError::Connect { to: to.clone(), error: refused }, 0x0A),
             (ClientError::ConnectTimeout { to, after: Duration::ZERO }, 0x0A),
             (ClientError::Fenced, 0x0A),
+            (ClientError::Expired, 0x0A),
             (ClientError::NoSilence(Duration::ZERO), 0x0A),
             (ClientError::Timeout(Duration::ZERO), 0x0B),
             (ClientError::Lost(Lost::Closed(Closed::BySelf)), 0x0B),

@@ -25,6 +25,7 @@ pub(crate) use limits::circuit_breaker::Down;
 pub use limits::lease_fence::{Fence, Stage};
 pub(crate) use limits::lease_fence::{Pass, submit_under};
 pub(crate) use limits::permit::{Permit, Wanted};
+pub(crate) use limits::standstill;
 pub(crate) use route::{Asker, Call};
 pub use route::{LinkCounters, LinkSettings, Route, SharedLink};
 pub use scheduling::in_flight::InFlight;

@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use holdfast_protocol::client::Tolerance;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, Function};
-use holdfast_runtime::{Retry, lock};
+use holdfast_runtime::{Retry, lock, time_since_boot};
 use tokio::sync::mpsc;
 
 use super::caller::{Caller, Waiting};
@@ -65,7 +65,7 @@ counters! {
         coalesced,
         /// Answered by an earlier reply.
         cached,
-        /// Not sent, because the client had gone.
+        /// Not sent, because the client had gone, or for a standstill.
         withdrawn,
     }
 }
@@ -90,6 +90,8 @@ pub struct SharedLink {
 pub(crate) struct Call {
     pub(super) unit_id: u8,
     pub(super) request: EncodedRequest,
+    /// When it came, by [`time_since_boot`].
+    pub(super) queued: Duration,
     pub(super) source: u64,
     pub(super) priority: Priority,
     pub(super) reply: Reply,
@@ -202,10 +204,10 @@ impl SharedLink {
         let priority = Priority::of(request, None, &self.preferred);
         let (ticket, waiting) = caller.begin(request, timeout, is_broadcast);
         let waiting = waiting.at_most(self.longest_wait());
-        let (request, source) = (request.clone(), caller.source);
+        let (request, queued, source) = (request.clone(), time_since_boot(), caller.source);
         let reply = Reply { to: Receiver::EventLoop(waiting), in_order: None, _place: place };
         // If the link has ended, the call ends as lost.
-        let _ = self.calls.send(Call { unit_id, request, source, priority, reply });
+        let _ = self.calls.send(Call { unit_id, request, queued, source, priority, reply });
         Some(ticket)
     }
 
@@ -247,6 +249,7 @@ impl Route {
         let call = Call {
             unit_id,
             request,
+            queued: time_since_boot(),
             source: asker.source,
             priority,
             reply: Reply {

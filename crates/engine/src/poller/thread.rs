@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use holdfast_memory::Memory;
 use holdfast_protocol::client::Tolerance;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, limit};
-use holdfast_runtime::{Retry, lock};
+use holdfast_runtime::{Retry, lock, time_since_boot};
 use thiserror::Error;
 use tokio::runtime::Builder;
 use tokio::sync::{mpsc, watch};
@@ -35,7 +35,7 @@ use crate::client::{Endpoint, Place};
 use crate::heartbeat::Heartbeat;
 use crate::link::{
     Call, Fault, Fence, InFlight, Link, LinkSettings, Permit, Priority, SharedLink, Stage, Wanted,
-    fault, serve,
+    fault, serve, standstill,
 };
 use crate::own_threads::OwnThreads;
 use crate::tls::client::Identity;
@@ -344,8 +344,8 @@ impl Poller {
     }
 
     /// Sends a write over the connection of a device. Returns a number, under which its result is
-    /// passed `to` a receiver. What can't be sent until a time, and one timeout of the device, fails with
-    /// [`Fault::Expired`].
+    /// passed `to` a receiver. What can't be sent until a time, and one timeout of the device, or waits
+    /// through a standstill, fails with [`Fault::Expired`].
     ///
     /// # Errors
     /// [`PollerError`] if there is no such device, or the request is not a write.
@@ -480,6 +480,7 @@ async fn run_commands(
     let mut running: HashMap<String, Running> = HashMap::new();
     let mut fences = Fences::default();
     let mut started = 0;
+    spawn_local(standstill::watch());
     loop {
         let command = tokio::select! {
             biased;
@@ -657,7 +658,8 @@ impl Running {
         let is_sent = Arc::new(OnceLock::new());
         let mut device = self.writes.subscribe();
         let sent = Arc::clone(&is_sent);
-        let permit = self.permit(until).and(Arc::new(move |is_sent| match is_sent {
+        let permit = self.permit(until).and(standstill::none_since(time_since_boot()));
+        let permit = permit.and(Arc::new(move |is_sent| match is_sent {
             true => *sent.get_or_init(|| true),
             false => true,
         }));

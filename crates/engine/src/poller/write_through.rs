@@ -11,6 +11,7 @@ use std::time::Duration;
 
 use holdfast_memory::{Access, Area, Memory, Outcome, Refusal, Write};
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, Function, Range, Request};
+use holdfast_runtime::time_since_boot;
 use tokio::sync::{mpsc, oneshot};
 
 use super::destination::ReadSettings;
@@ -18,7 +19,8 @@ use crate::client::ClientError;
 use crate::items::{Items, touched};
 use crate::link::{
     Caller, Down, Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, Wanted,
-    confirmation, exception, exception_code, exception_in, fault, pending_reply, submit_under,
+    confirmation, exception, exception_code, exception_in, fault, pending_reply, standstill,
+    submit_under,
 };
 
 /// The most writes into one memory that wait for devices.
@@ -55,6 +57,8 @@ pub(super) struct PassedWrite {
     pdu: Vec<u8>,
     /// As the device gets it.
     request: EncodedRequest,
+    /// When it came, by [`time_since_boot`].
+    queued: Duration,
     reply: Receiver,
     _place: Place,
 }
@@ -200,6 +204,7 @@ impl Passage {
             range: range.clone(),
             request: translated(pdu, range, read.is_some())?,
             pdu: pdu.to_vec(),
+            queued: time_since_boot(),
             reply,
             _place: place,
         };
@@ -258,7 +263,7 @@ impl PassedWrite {
             self.refuse(ExceptionCode::GatewayPathUnavailable);
             return Vec::new();
         }
-        let of_client = permit.and(self.reply.wanted());
+        let of_client = permit.and(standstill::none_since(self.queued)).and(self.reply.wanted());
         let call = async |request: &EncodedRequest, permit| {
             link.call(unit_id, request, timeout, Priority::Urgent, permit).await
         };
@@ -298,7 +303,7 @@ impl PassedWrite {
             None => call(&self.request, &of_client).await,
         };
         let outcome = answered.as_ref().map(drop).map_err(|error| fault(error));
-        // Its device or its client has gone, and it was not sent.
+        // Its device or its client has gone, or may have gone in a standstill, and it was not sent.
         if outcome == Err(Fault::Expired) {
             if !self.reply.is_unwanted() {
                 self.refuse(ExceptionCode::GatewayPathUnavailable);

@@ -96,7 +96,7 @@ _LINK = object_of(
         "refused_down": COUNT,
         "coalesced": count("Answered by an identical read"),
         "cached": count("Answered by an earlier reply"),
-        "withdrawn": count("Not sent: the client had gone"),
+        "withdrawn": count("Not sent: the client had gone, or after a standstill"),
         "waiting": COUNT,
         "unexpected_replies": count("Without a request"),
         "stray_bytes": count("Not part of an expected reply"),

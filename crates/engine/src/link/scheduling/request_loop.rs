@@ -16,6 +16,7 @@ use crate::link::access::Link;
 use crate::link::fault::{Exchanged, Fault, exception, exception_code, fault};
 use crate::link::limits::circuit_breaker::{Down, OPEN_AFTER_TIMEOUTS};
 use crate::link::limits::permit::{Permit, Wanted};
+use crate::link::limits::standstill;
 use crate::link::route::{Call, LinkSettings, Reply, SharedLink};
 use crate::link::scheduling::shared_reads::{SharedReads, shareable};
 use crate::link::scheduling::write_barrier::Order;
@@ -55,7 +56,7 @@ struct Serving {
 
 impl Serving {
     async fn carry_out(self: Rc<Self>, call: Call, shared: Arc<SharedLink>) {
-        let Call { unit_id, request, source, priority, mut reply } = call;
+        let Call { unit_id, request, queued, source, priority, mut reply } = call;
         let counters = &shared.counters;
         // Callers of an event loop wait for their own replies, and share one source.
         if reply.is_of_listener() {
@@ -106,11 +107,21 @@ impl Serving {
         let wanted: Vec<_> = replies.iter().map(Reply::wanted).collect();
         let wanted: Wanted =
             Arc::new(move |is_sent| wanted.iter().filter(|wanted| wanted(is_sent)).count() > 0);
-        let permit = Permit { wanted: Some(wanted), ..Permit::default() };
+        let permit = match request.is_read() {
+            true => Permit::default(),
+            false => Permit::default().and(standstill::none_since(queued)),
+        };
+        let permit = permit.and(wanted);
         let answered = self.link.exchange(unit_id, &request, timeout, true, &permit).await;
         drop(turn);
-        if matches!(&answered, Err(error) if matches!(**error, ClientError::Expired)) {
-            return counters.withdrawn.add();
+        if let Err(error) = &answered
+            && matches!(**error, ClientError::Expired)
+        {
+            counters.withdrawn.add();
+            // After a standstill, a caller may still be there.
+            replies.retain(|reply| !reply.is_unwanted());
+            let pdu = exception(request.pdu(), exception_code(error));
+            return replies.into_iter().for_each(|reply| reply.send(Err((error, &pdu))));
         }
         let from_listener = replies.iter().any(Reply::is_of_listener);
         self.record((unit_id, request.pdu()[0]), &answered, from_listener, &shared);
