@@ -345,3 +345,25 @@ def test_ages_survive_a_reload_that_does_not_change_where_values_come_from(
         assert asked() == DEAD
         appliance.reload(loaded(None))
         assert asked() is None
+
+
+def test_the_ranges_of_a_device_that_a_reload_disables_are_stale_at_once(
+    tmp_path: Path, meter: Meter
+) -> None:
+    file = tmp_path / "appliance.yaml"
+
+    def loaded(**more: Any) -> Any:
+        file.write_text(config(meter, NEVER, writes="pass", **more))
+        return load(file)
+
+    with Appliance(loaded()) as appliance, client(appliance) as plc:
+
+        def asked() -> int | None:
+            return code(lambda: plc.read_holding_registers(10, 3))
+
+        wire.until(lambda: asked() is None, "the device was read")
+        appliance.reload(loaded(enabled=False))
+        assert asked() == DEAD
+        assert code(lambda: plc.write_register(10, 1)) == DEAD, "it would reach no device"
+        appliance.reload(loaded())
+        wire.until(lambda: asked() is None, "the device was read again")

@@ -68,11 +68,12 @@ class Mirrors(Part):
                 if read.into is None:
                     continue
                 place = place_of(read.into, read.count)
-                source = (name, device.url, device.unit, read.area, read.address)
+                # Nobody reads a disabled device: its values are not current, however young.
+                source = (name, device.enabled, device.url, device.unit, read.area, read.address)
                 age = known.get((source, place))
                 if age is None:
                     refuses = stale.answer == "exception"
-                    lease = _lease_number(config, name, place)
+                    lease = _lease_number(config, name, place) if device.enabled else None
                     age = _core.MirrorAge(stale.after, refuses=refuses, lease=lease)
                 yield Mirror(name, source, place, stale, age)
 
