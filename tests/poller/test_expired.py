@@ -14,7 +14,7 @@ from support import wire
 from support.fake_device import Stream
 from support.native_poller import (
     EXPIRED,
-    RESET,
+    WITHDRAWN,
     Made,
     ReportingPoller,
     device,
@@ -112,7 +112,7 @@ def test_a_write_that_waits_is_not_sent_once_its_device_has_gone(
         poller.add(made("a"))
         number = poller.write("a", WRITE)
         change(poller, made)
-        assert written(poller, number) == RESET
+        assert written(poller, number) == WITHDRAWN
         line.go_on.set()
         poller.add(made("b"))
         assert written(poller, poller.write("b", WRITE)) == 0

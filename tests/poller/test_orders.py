@@ -18,6 +18,7 @@ from support.native_poller import (
     REFUSED,
     RESET,
     TIMEOUT,
+    WITHDRAWN,
     ReportingPoller,
     device,
     device_at,
@@ -124,7 +125,7 @@ def test_the_end_of_a_device_ends_the_writes_that_were_not_sent(poller: Reportin
         assert begun.wait(wire.DEADLINE)
         assert poller.remove("a")
         _, writes = taken(poller, lambda _, writes: len(writes) == 2)
-        assert sorted(writes) == [(each, RESET) for each in waiting]
+        assert sorted(writes) == [(each, WITHDRAWN) for each in waiting]
         go_on.set()
         assert written(poller, number) == 0
         assert [each.pdu[0] for each in fake.requests].count(6) == 1

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 Made: TypeAlias = "partial[PolledDevice]"
 """A device, but for the receiver of its polls."""
 
-TIMEOUT, REFUSED, RESET, INVALID, EXPIRED = 0x8001, 0x8002, 0x8003, 0x8004, 0x800A
+TIMEOUT, REFUSED, RESET, INVALID = 0x8001, 0x8002, 0x8003, 0x8004
+EXPIRED, WITHDRAWN = 0x800A, 0x800C
 
 
 class ReportingPoller:

@@ -16,6 +16,7 @@ UNREACHABLE = FAULTS["unreachable"]
 LOST = FAULTS["reset"]
 STANDBY = FAULTS["standby"]
 EXPIRED = FAULTS["expired"]
+WITHDRAWN = FAULTS["withdrawn"]
 
 _WORDS = {code: word for word, code in FAULTS.items()}
 _TEXTS = {
@@ -30,6 +31,7 @@ _TEXTS = {
     FAULTS["flooded"]: "a flood of data that was not requested",
     STANDBY: "another node uses the device",
     EXPIRED: "it has waited too long",
+    WITHDRAWN: "its device was removed or changed",
 }
 
 

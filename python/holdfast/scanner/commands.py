@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Any
 from holdfast.client.requests import write_typed
 from holdfast.errors import NOT_EXECUTED
 from holdfast.events import log_lines
-from holdfast.polling.faults import EXPIRED, NO_CONNECTION, STANDBY, UNREACHABLE, fault_text
+from holdfast.polling.faults import (
+    EXPIRED,
+    NO_CONNECTION,
+    STANDBY,
+    UNREACHABLE,
+    WITHDRAWN,
+    fault_text,
+)
 from holdfast.scanner.errors import Moved, Refused
 from holdfast.scanner.late_commands import SEND_AGAIN, Lateness
 from holdfast.scanner.messages.types import Answer
@@ -36,7 +43,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.tag import Tag
 
-NOT_WRITTEN_FAULTS = (*NOT_EXECUTED, NO_CONNECTION, UNREACHABLE, STANDBY, EXPIRED)
+NOT_WRITTEN_FAULTS = (*NOT_EXECUTED, NO_CONNECTION, UNREACHABLE, STANDBY, EXPIRED, WITHDRAWN)
 """Faults of a write that the device certainly has not carried out."""
 
 MOVED = f"not written: {fault_text(STANDBY)}"

@@ -59,6 +59,8 @@ faults! {
     Expired = 10, "expired";
     /// There is no way to the host, or nothing has its name. Nothing was sent.
     Unreachable = 11, "unreachable";
+    /// A write whose device was removed or changed while it waited. Nothing was sent.
+    Withdrawn = 12, "withdrawn";
 }
 
 /// Exceptions of a gateway that could not reach the unit.

@@ -370,7 +370,7 @@ impl Poller {
     }
 
     /// Stops polling a device. Its connection is closed when no other device uses it. Writes that were not
-    /// sent end with [`Fault::Reset`]. Returns whether there was a device of that name.
+    /// sent end with [`Fault::Withdrawn`]. Returns whether there was a device of that name.
     pub fn remove(&self, name: &str) -> bool {
         let mut all = lock(&self.polled);
         let known = all.remove(name).is_some();
@@ -553,7 +553,7 @@ async fn run_commands(
             }
             Command::Write { device, ticket, request, until, to } => match running.get(&device) {
                 Some(device) => device.write(ticket, request, until, to),
-                None => to.push_write(Written { ticket, outcome: Err(Fault::Reset) }),
+                None => to.push_write(Written { ticket, outcome: Err(Fault::Withdrawn) }),
             },
         }
     }
@@ -686,7 +686,7 @@ impl Running {
         spawn_local(async move {
             let outcome = tokio::select! {
                 biased;
-                () = withdrawn => Err(Fault::Reset),
+                () = withdrawn => Err(Fault::Withdrawn),
                 outcome = sending => outcome,
             };
             to.push_write(Written { ticket, outcome });
