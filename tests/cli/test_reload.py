@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import stat
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -127,6 +129,34 @@ def test_sighup_reloads_also_that_of_a_closed_terminal(running: Running) -> None
         running.command.process.send_signal(signal.SIGHUP)
         wire.until(lambda: client.ask(WRITE) == FORBIDDEN, "the rule has changed")
     assert "info reloaded" in running.end()
+
+
+HANGUP_AT_IMPORT = """
+import os, signal, sys
+
+class Hangup:
+    def find_spec(self, name, *_):
+        if name == "holdfast.cli.services.run":
+            os.kill(os.getpid(), signal.SIGHUP)
+
+from holdfast.cli import main
+sys.meta_path.insert(0, Hangup())
+main(prog_name="holdfast")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGHUP")
+def test_sighup_before_the_configuration_is_read_reloads_after_the_start(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    file.write_text(CONFIGURATION.format(size=100, access="read-only", more=""))
+    command = [sys.executable, "-c", HANGUP_AT_IMPORT, "run", str(file)]
+    with subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stderr is not None
+        assert any("info reloaded" in line for line in process.stderr), "it has ended"
+        process.terminate()
+    assert process.returncode == 0
 
 
 def test_a_watched_file_reloads_when_another_one_takes_its_place(

@@ -17,6 +17,7 @@ from holdfast import __version__
 from holdfast.cli import answers, standard_output
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.old_spellings import OLD_NAMES, hint, renewed
+from holdfast.cli.signals import keep_hangups
 from holdfast.runtime import extras
 from holdfast.runtime.interpreter import spare_memory
 from holdfast.runtime.text import either, sentence
@@ -185,6 +186,8 @@ class Program(SuggestingGroup):
             return None
         # An appliance runs for years, and on small machines. Other commands end, or need OpenSSL.
         sparing = spare_memory() if cmd_name == "run" else contextlib.nullcontext()
+        if cmd_name == "run" and not ctx.resilient_parsing:
+            keep_hangups()
         try:
             with sparing:
                 return _imported(COMMANDS[cmd_name])

@@ -41,6 +41,17 @@ def ending_signals() -> Iterator[signal.Signals]:
             yield number
 
 
+_early_hangups: list[int] = []
+"""SIGHUP before there are `Signals`."""
+
+
+def keep_hangups() -> None:
+    """Keeps each SIGHUP for the first `Signals`, in place of the end of the process."""
+    hangup = getattr(signal, "SIGHUP", None)
+    if hangup is not None:
+        signal.signal(hangup, lambda number, _frame: _early_hangups.append(number))
+
+
 SIGNAL_INTERVAL_S = 0.2
 """A command that waits for something else looks for signals this often."""
 
@@ -66,6 +77,7 @@ class Signals:
         hangup = getattr(signal, "SIGHUP", None)
         if reload != "never" and hangup is not None:
             signal.signal(hangup, self._request_reload)
+            self._reload = bool(_early_hangups)
 
     @contextmanager
     def interrupting(self) -> Iterator[None]:
