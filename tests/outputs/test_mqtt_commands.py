@@ -21,6 +21,7 @@ from holdfast.outputs.device_access import NotWritten
 from holdfast.outputs.mqtt import commands
 from holdfast.polling.faults import STANDBY, fault_word
 from holdfast.runtime.standstill import STANDSTILL_S
+from holdfast.tags.text import value_from
 from support import wire
 from support.audits import await_writes, full, lines, writes
 from support.mqtt_plant import TAGS, Client, Plant
@@ -28,6 +29,8 @@ from support.mqtt_plant import TAGS, Client, Plant
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from holdfast.tags import Tag
 
 
 @pytest.fixture(autouse=True)
@@ -107,6 +110,26 @@ def test_a_value_that_does_not_fit_is_refused(plant: Plant, text: str | bytes, d
     assert (answer["reason"], answer["detail"]) == ("invalid_value", detail)
     assert device.memory.read("holding_registers", 0, 1) == [77]
     assert plant.status()["commands"]["refused"] == 1
+
+
+def test_a_fault_in_one_command_ends_no_other(
+    plant: Plant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(tag: Tag, *more: Any, **options: Any) -> Any:
+        if tag.name == "temperature":
+            raise RuntimeError("a bug")
+        return value_from(tag, *more, **options)
+
+    monkeypatch.setattr("holdfast.appliance.parts.tag_writes.value_from", fails)
+    plant.device()
+    probe = plant.probe("plant/#")
+    plant.run(writes=True)
+    probe.until("plant/holdfast/status/pump", "online")
+    probe.publish("plant/pump/temperature/set", "21.5")
+    probe.publish("plant/pump/valve/set", "true")
+    assert reply(probe, "temperature")["reason"] == "internal_error"
+    assert reply(probe, "valve")["status"] == "accepted"
+    assert plant.status()["reconnects"] == 0
 
 
 def test_the_reply_goes_to_the_response_topic(plant: Plant) -> None:

@@ -190,12 +190,16 @@ def test_a_limit_that_floats_do_not_have_may_be_written_itself(
     assert it.value(held) == pytest.approx(limit, rel=1e-7, abs=2**-24 * abs(offset))
 
 
-def test_a_float16_that_does_not_fit_is_left_to_its_codec() -> None:
-    it = tag(type="float16", min=0)
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [("float16", 1e6), ("float16", 70000), ("float32", 1e39), ("float32", -(10**39))],
+)
+def test_a_float_that_does_not_fit_is_left_to_its_codec(kind: str, value: float) -> None:
+    it = tag(type=kind, null=[7])
     assert it.raw(65504) == 65504
-    assert it.raw(1e6) == 1e6
-    with pytest.raises(DoesNotFit, match=r"outside -65504\.0 to 65504\.0 of float16"):
-        encode(it.raw(1e6), "float16")
+    assert it.raw(value) == value
+    with pytest.raises(DoesNotFit, match=rf"is outside -.* of {kind}"):
+        encode(it.raw(value), kind)
 
 
 def test_the_limits_themselves_may_be_written() -> None:

@@ -44,7 +44,8 @@ def limits(base: str) -> tuple[float, float]:
 def nearest_float(number: float, base: str) -> float:
     """The nearest number of a floating-point type. Raises `OverflowError` beyond the type."""
     form = f">{FLOATS[base]}"
-    found: float = struct.unpack(form, struct.pack(form, number))[0]
+    # Of an integer beyond the type, `struct` has an error of its own.
+    found: float = struct.unpack(form, struct.pack(form, float(number)))[0]
     return found
 
 

@@ -168,5 +168,8 @@ def _request(tag: Tag | None, text: str, *, states: bool) -> tuple[Request, list
         )
     except (ConversionError, ValueError, TypeError, OverflowError) as error:
         raise NotWritten("invalid_value", str(error)) from None
+    except Exception:  # A fault in one command must not end the connection of all others.
+        log_lines.problem("tag_write_failed")
+        raise NotWritten("internal_error", "an internal error, see the log") from None
     is_bit = tag.of_type.base == "bit"
     return request, [int(raw)] if is_bit else [int(value) for value in encoded]
