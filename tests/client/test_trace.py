@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import sys
 import threading
+import weakref
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -202,3 +204,44 @@ def test_an_interrupt_in_the_trace_ends_the_event_loop(at: str) -> None:
     with Stream("tcp") as device, pytest.raises(KeyboardInterrupt):
         read_twice(device.url, trace)
     assert not interrupts
+
+
+class Owner:
+    """A device of a program, with a method for the bytes of its client."""
+
+    def __init__(self, kind: type[Any], url: str) -> None:
+        self.client = kind(url, trace=self.note, timeout=wire.DEADLINE)
+
+    def note(self, direction: str, data: bytes) -> None:
+        pass
+
+
+def test_a_client_that_shows_its_bytes_to_its_owner_ends_with_it() -> None:
+    with Stream("tcp") as device:
+        owner = Owner(holdfast.SyncClient, device.url)
+        assert owner.client.read_holding_registers(7, 2) == [7, 8]
+        left = weakref.ref(owner)
+        del owner
+        gc.collect()
+        assert left() is None
+        wire.until(lambda: not device.is_connected, "it is closed")
+
+
+@pytest.mark.parametrize("scheme", ["tcp", "rtu+tcp"])
+def test_a_client_for_asyncio_that_shows_its_bytes_to_its_owner_ends_with_it(scheme: str) -> None:
+    def forget(owners: list[Owner]) -> None:
+        owners.clear()
+        gc.collect()
+
+    async def main(device: Stream) -> None:
+        owners = [Owner(holdfast.Client, device.url)]
+        assert await owners[0].client.read_holding_registers(7, 2) == [7, 8]
+        left = weakref.ref(owners[0])
+        with pytest.warns(ResourceWarning, match="unclosed client"):
+            forget(owners)
+        gc.collect()  # Of the warning too, which has the client as its source.
+        assert left() is None
+        await asyncio.to_thread(wire.until, lambda: not device.is_connected, "it is closed")
+
+    with Stream(scheme) as device:
+        asyncio.run(main(device))

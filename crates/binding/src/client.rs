@@ -21,6 +21,7 @@ use holdfast_protocol::pdu::{
 use pyo3::exceptions::{PyException, PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyList};
+use pyo3::{PyTraverseError, PyVisit};
 
 use crate::arguments::{byte, os_text, seconds, unknown, within, word};
 use crate::memory::{Integer, integer, numbers};
@@ -312,6 +313,7 @@ impl Endpoint {
 #[pyclass(frozen, module = "holdfast")]
 pub struct BlockingClient {
     core: Core,
+    trace: Option<Arc<Py<PyAny>>>,
     /// How often calls were ended.
     ended: AtomicU64,
 }
@@ -322,7 +324,8 @@ impl BlockingClient {
     #[pyo3(signature = (endpoint, trace=None))]
     fn new(endpoint: PyRef<'_, Endpoint>, trace: Option<Py<PyAny>>) -> BlockingClient {
         let core = Core::new(endpoint.core.clone());
-        let core = match trace {
+        let trace = trace.map(Arc::new);
+        let core = match trace.clone() {
             None => core,
             Some(trace) => core.traced(Arc::new(move |direction, bytes| {
                 if let Some(raised) = show(&trace, direction, bytes) {
@@ -330,7 +333,7 @@ impl BlockingClient {
                 }
             })),
         };
-        BlockingClient { core, ended: AtomicU64::new(0) }
+        BlockingClient { core, trace, ended: AtomicU64::new(0) }
     }
 
     /// Sends a request and returns its result as a Python object. Once `is_cancelled` returns true, the
@@ -388,6 +391,11 @@ impl BlockingClient {
     #[getter]
     fn longest_late(&self) -> f64 {
         self.core.longest_late().as_secs_f64()
+    }
+
+    /// A trace often belongs to the owner of the client. Such a cycle is broken at the owner.
+    fn __traverse__(&self, visit: PyVisit<'_>) -> Result<(), PyTraverseError> {
+        visit.call(self.trace.as_deref())
     }
 }
 

@@ -20,6 +20,7 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from math import ceil, inf
 from threading import Event
 from typing import TYPE_CHECKING, Any, Protocol, cast
+from weakref import ref
 
 from holdfast._core import Attempt, BlockingClient, Connection
 from holdfast.client.endpoint import endpoint
@@ -285,8 +286,21 @@ class AsyncConnection:
         # An object for each loop: calls that a closed loop has left behind may end at any time,
         # and must not give back places of the new one.
         late = (0, 0.0) if last is None else (last.late, last.longest_late)
+        # The trace often belongs to the owner of the client: the loop must not keep that alive.
+        myself = ref(self)
+
+        def trace(direction: str, data: bytes) -> None:
+            client = myself()
+            if client is not None and client._trace is not None:
+                client._trace(direction, data)
+
         here = _LoopConnection(
-            self._target, self._endpoint, self._max_in_flight, self._trace, loop, *late
+            self._target,
+            self._endpoint,
+            self._max_in_flight,
+            None if self._trace is None else trace,
+            loop,
+            *late,
         )
         self._last = here
         sleep_at_end(loop)
