@@ -143,6 +143,24 @@ def test_failures_are_printed_and_counted() -> None:
     assert areas["input_registers"]["given_up"]["code"] == 1
 
 
+def test_what_can_not_be_read_again_is_a_failure() -> None:
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 3 or first + count > 1:
+            return exception(pdu, 1)
+        reads.append(pdu)  # Whether the unit id answers, the search, and the reading after it.
+        return registers(pdu) if len(reads) < 3 else exception(pdu, 4)
+
+    reads: list[bytes] = []
+    with FakeDevice(answers) as device:
+        options = ("--units", "1", "--areas", "hr", "--range", "0-0", "--times", "1")
+        found = answer("describe", device.url, *options, code=1)
+    assert (found["ok"], found["reason"]) == (False, "exception")
+    [unit] = found["units"]
+    assert not unit["complete"]
+    assert unit["not_described"] == [{"area": "holding_registers", "address": 0, "count": 1}]
+
+
 def test_a_device_that_ignores_unit_ids_is_described_once() -> None:
     def answers(pdu: bytes) -> bytes:
         first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])

@@ -309,6 +309,19 @@ def test_the_first_reading_must_succeed(server: holdfast.Server, tmp_path: Path)
     assert line.startswith("holdfast: REST at http://127.0.0.1:1: ")
 
 
+def test_a_device_that_refuses_reads_across_borders_is_watched_in_parts() -> None:
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 3 or first // 20 != (first + count - 1) // 20 or first + count > 50:
+            return exception(pdu, 2)
+        return registers(pdu)
+
+    with FakeDevice(answers) as device:
+        result = invoke("watch", device.url, "--times", "2", *OFTEN)
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert result.stderr.splitlines()[-1] == f"watching {device.url}, unit 1"
+
+
 def test_a_device_without_addresses_can_not_be_watched() -> None:
     with FakeDevice(lambda pdu: exception(pdu, 1)) as device:
         assert failure("watch", device.url)[-1] == f"holdfast: {device.url}: no address was found"

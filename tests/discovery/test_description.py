@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import random
 import struct
+import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -47,9 +48,14 @@ def test_every_read_has_the_unit_of_the_description(serve: Serve) -> None:
     found = Description(5, Survey(span=range(100)))
     with holdfast.SyncClient(cli.url(serve({1: other, 5: memory}))) as client:
         description.describe(found, client, reads=1, every=1, delay=0)
-    assert found.reads == {
-        ("holding_registers", range(20)): [[555] * 20],
-        ("coils", range(3)): [[0] * 3],
+    contents = {
+        (area, address): value
+        for (area, block), [read] in found.reads.items()
+        for address, value in zip(block, read, strict=True)
+    }
+    assert contents == {
+        **{("holding_registers", address): 555 for address in range(20)},
+        **{("coils", address): 0 for address in range(3)},
     }
 
 
@@ -167,7 +173,7 @@ def test_a_scale_factor_that_is_too_far_leaves_the_raw_number() -> None:
     )
     near = dataclasses.replace(far, name="near", address=164)
     model = sunspec.Model(160, "mppt", "", 2, 300, (near, far))
-    spec = sunspec.SunSpec(0, (model,), is_complete=True)
+    spec = sunspec.SunSpec(0, (model,))
     found = Description(1, Survey(["holding_registers"]), sunspec=spec)
     description.conclude(found)
     first, second = (each.tag for each in found.tags)
@@ -224,6 +230,108 @@ def test_a_device_that_does_not_answer_absent_addresses_is_described() -> None:
     with FakeDevice(answers) as device, holdfast.SyncClient(device.url, timeout=0.05) as client:
         description.describe(found, client, reads=1, every=1, delay=0)
     assert found.survey.areas[0].ranges == [range(9)]
+
+
+def test_a_device_that_refuses_reads_across_borders_is_described_whole(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each read is within 20 registers, wherever those that worked before have begun."""
+    refused = []
+
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 3 or first // 20 != (first + count - 1) // 20 or first + count > 60:
+            refused.append(pdu)
+            return exception(pdu, 2)
+        return registers(pdu)
+
+    found = Description(1, Survey(["holding_registers"], span=range(3, 70)))
+    turns = []
+    with FakeDevice(answers) as device, holdfast.SyncClient(device.url) as client:
+        monkeypatch.setattr(time, "sleep", lambda _: turns.append(len(refused)))
+        description.describe(found, client, reads=3, every=1, delay=0)
+    assert turns == [len(refused)] * 2, "what was refused is not asked again"
+    description.conclude(found)
+    assert not found.unread
+    assert list(description.undescribed(found)) == []
+    assert sum(each.tag.count for each in found.tags) == 57
+    assert all(each.tag.address // 20 == (each.tag.end - 1) // 20 for each in found.tags)
+    assert all(len(each.values) == 3 for each in found.tags)
+
+
+def test_what_can_not_be_read_again_costs_nothing_else() -> None:
+    asked: list[bytes] = []
+
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        asked.append(pdu)
+        is_again = len(asked) > searched > 0
+        if pdu[0] != 3 or first + count > 40 or (is_again and first <= 17 < first + count):
+            return exception(pdu, 2)
+        return registers(pdu, 7)
+
+    searched = 0
+    found = Description(1, Survey(["holding_registers"], span=range(50)))
+
+    def note(survey: Survey) -> None:
+        nonlocal searched
+        if survey.is_done:
+            searched = len(asked)
+
+    with FakeDevice(answers) as device, holdfast.SyncClient(device.url) as client:
+        description.describe(found, client, reads=2, every=0, delay=0, progress=note)
+    description.conclude(found)
+    assert found.unread == {
+        ("holding_registers", "exception 02 (Illegal Data Address)"): [range(17, 18)]
+    }
+    assert list(description.undescribed(found)) == [("holding_registers", range(17, 18))]
+    assert sum(each.tag.count for each in found.tags) == 39
+
+
+def test_unused_registers_of_a_device_of_whole_values_are_whole_values() -> None:
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 3 or first % 2 or count % 2 or first + count > 300 or count > 80:
+            return exception(pdu, 2)
+        values = [5 if address in (0, 150, 299) else 0 for address in range(first, first + count)]
+        return bytes([3, 2 * count]) + struct.pack(f">{count}H", *values)
+
+    found = Description(1, Survey(["holding_registers"], span=range(400)))
+    with FakeDevice(answers) as device, holdfast.SyncClient(device.url) as client:
+        description.describe(found, client, reads=1, every=0, delay=0)
+    description.conclude(found)
+    unused = [each.tag for each in found.tags if each.tag.count > 4]
+    assert sum(each.count for each in unused) > 280
+    assert all(not each.address % 2 and not each.count % 2 for each in unused)
+    assert max(each.count for each in unused) <= 80
+
+
+@pytest.mark.parametrize(
+    ("unreadable", "models", "flaw"),
+    [
+        (-1, [1, 103], None),
+        (80, [1], "exception 03 (Illegal Data Value), of the model at 70"),
+    ],
+)
+def test_sunspec_models_are_read_in_parts_if_they_must(
+    unreadable: int, models: list[int], flaw: str | None
+) -> None:
+    content = sunspec_device.registers(sunspec_device.common(), sunspec_device.inverter())
+
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 3 or first + count > len(content):
+            return exception(pdu, 2)
+        if count > 30 or first <= unreadable < first + count:
+            return exception(pdu, 3)
+        return bytes([3, 2 * count]) + struct.pack(f">{count}H", *content[first : first + count])
+
+    found = Description(1, Survey(["holding_registers"], span=range(200)))
+    with FakeDevice(answers) as device, holdfast.SyncClient(device.url) as client:
+        description.describe(found, client, reads=0, every=0, delay=0)
+    assert found.sunspec is not None
+    assert [each.id for each in found.sunspec.models] == models
+    assert found.sunspec.flaw == flaw
 
 
 def test_an_interruption_costs_only_the_registers_at_hand(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,11 +24,11 @@ from __future__ import annotations
 
 import bisect
 import time
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias, TypeVar
 
-from holdfast.client.requests import carry_out, carry_out_async
+from holdfast.client.requests import REFUSALS, carry_out, carry_out_async
 from holdfast.errors import ConnectionLost, InvalidResponse, ModbusError, ModbusException
 from holdfast.protocol import (
     ADDRESSES,
@@ -148,6 +148,10 @@ class AreaMap:
     """The results for an area."""
 
     area: Area
+    limit: int
+    """The most addresses that one read may be for, as far as is known."""
+    width: int = 1
+    """The addresses that are read together: a count of a read is a multiple of it."""
     ranges: list[range] = field(default_factory=list)
     """The existing addresses, sorted; ranges are never adjacent."""
     refused: dict[int, Failure] = field(default_factory=dict)
@@ -182,7 +186,7 @@ class AreaMap:
     def _refused_with(self, failure: Failure) -> list[range]:
         found: list[range] = []
         for address in sorted(at for at, why in self.refused.items() if why == failure):
-            _add(found, address, 1)
+            add_addresses(found, address, 1)
         return found
 
     @property
@@ -208,6 +212,17 @@ class AreaMap:
         """The first range that begins behind an address."""
         at = bisect.bisect_right(self.ranges, address, key=lambda each: each.start)
         return self.ranges[at] if at < len(self.ranges) else None
+
+    @property
+    def takes_less(self) -> bool:
+        """Whether reads may be for fewer addresses than the standard allows."""
+        return self.limit < READ_LIMITS[self.area]
+
+    def blocks(self, extent: range) -> Iterator[range]:
+        """A range, in reads that are as large as one that succeeded."""
+        step = max(1, self.largest)
+        for first in range(extent.start, extent.stop, step):
+            yield range(first, min(first + step, extent.stop))
 
     def done(self, span: range) -> int:
         """How many addresses of a span are done."""
@@ -244,7 +259,10 @@ class Survey:
             raise ValueError(f"span is {span}, allowed: inside 0 to {LAST_ADDRESS}")
         self.span = span
         self.exact = exact
-        self.areas = [AreaMap(area) for area in areas]
+        self.areas = [
+            AreaMap(area, min(READ_LIMITS[area], max_quantity or READ_LIMITS[area]))
+            for area in areas
+        ]
         self.findings: list[Finding] = []
         """The ranges in the order in which they were found. One that turns out to be longer follows
         again."""
@@ -423,14 +441,9 @@ class _Search:
     """The search in one area."""
 
     def __init__(self, survey: Survey, found: AreaMap) -> None:
-        limit = READ_LIMITS[found.area]
         self.area = found.area
         self._survey = survey
         self._found = found
-        self._width = 1
-        """The addresses that are read together: a count of a read is a multiple of it."""
-        self._limit = min(limit, survey.max_quantity or limit)
-        """The largest read, in multiples of the width."""
         self._first = survey.span.start
         self._stop = survey.span.stop
         self._has_begun = False
@@ -468,8 +481,8 @@ class _Search:
             return False
         for probe in self._survey.value_reads(self.area):
             if (yield from self._survey.read(found, probe)) is None:
-                self._width = probe.count
-                self._limit //= probe.count
+                found.width = probe.count
+                found.limit -= found.limit % probe.count
                 # That a register is refused alone does not show that it is absent.
                 self._refused.clear()
                 self._places.clear()
@@ -505,7 +518,7 @@ class _Search:
         """Reads the range around a hit, and ranges close behind it."""
         while hit is not None:
             size = yield from self._follow_back(hit - 1, self._floor(hit))
-            end = yield from self._follow(hit + self._width, size)
+            end = yield from self._follow(hit + self._found.width, size)
             whole = self._found.range_of(hit)
             assert whole is not None
             self._survey.findings.append(Finding(self._found.area, whole))
@@ -533,7 +546,7 @@ class _Search:
         """The first existing address that was not found before."""
         for address in addresses:
             is_known = self._found.range_of(address) is not None
-            if is_known or address + self._width > self._stop:
+            if is_known or address + self._found.width > self._stop:
                 return None
             if address not in self._refused and (yield from self._read(address, 1)) is None:
                 return address
@@ -546,7 +559,7 @@ class _Search:
         places does not show that an address is absent.
         """
         at = bisect.bisect(self._places, address)
-        while at and (address - self._places[at - 1]) % self._width:
+        while at and (address - self._places[at - 1]) % self._found.width:
             at -= 1
         return self._places[at - 1] + 1 if at else self._first
 
@@ -558,18 +571,18 @@ class _Search:
         pace = self._pace(max(size, 2 if self._survey.exact else 1))
         following = self._found.range_of(at) or self._found.next_range(at)
         stop = self._stop if following is None else following.start
-        while (left := (stop - at) // self._width) > 0:
+        while (left := (stop - at) // self._found.width) > 0:
             count = min(pace.count, left)
             if count == 1 and at in self._refused:
                 return at
             outcome = yield from self._read(at, count)
             if outcome is None:
-                at += count * self._width
+                at += count * self._found.width
                 if self._is_in_order:
                     self.reached(at)
             elif count == 1:
                 return at
-            self._limit = pace.changed(count, outcome)
+            pace.changed(count, outcome)
         return at if following is None or at < stop else following.stop
 
     def _follow_back(self, at: int, floor: int) -> Steps[int]:
@@ -577,32 +590,32 @@ class _Search:
         the largest block that could be read."""
         pace = self._pace(1)
         largest = 1
-        while left := (at + 1 - floor) // self._width:
+        while left := (at + 1 - floor) // self._found.width:
             count = min(pace.count, left)
-            outcome = yield from self._read(at + 1 - count * self._width, count)
+            outcome = yield from self._read(at + 1 - count * self._found.width, count)
             if outcome is None:
-                at -= count * self._width
+                at -= count * self._found.width
                 largest = max(largest, count)
             elif count == 1:
                 break
-            self._limit = pace.changed(count, outcome)
+            pace.changed(count, outcome)
         return largest
 
     def _pace(self, count: int) -> _Pace:
-        return _Pace(self._limit, self._found, count, self._width)
+        return _Pace(self._found, count)
 
     def _read(self, address: int, count: int) -> Steps[Outcome]:
         """Reads `count` times the width, and records the result for the addresses."""
-        probe = Probe(self.area, address, count * self._width)
+        probe = Probe(self.area, address, count * self._found.width)
         outcome = yield from self._survey.read(self._found, probe)
         self._record(address, count, outcome)
         return outcome
 
     def _record(self, address: int, count: int, outcome: Outcome) -> None:
         if outcome is None:
-            registers = count * self._width
+            registers = count * self._found.width
             self._found.largest = max(self._found.largest, registers)
-            _add(self._found.ranges, address, registers)
+            add_addresses(self._found.ranges, address, registers)
             self._forget_failures(address, registers)
         elif count == 1:
             self._refused[address] = outcome
@@ -622,28 +635,31 @@ class _Pace:
     block was too large.
     """
 
-    def __init__(self, limit: int, found: AreaMap, count: int, width: int) -> None:
-        self.limit = limit
-        self.count = min(count, limit)
+    def __init__(self, found: AreaMap, count: int) -> None:
         self._found = found
-        self._width = width
+        self.count = min(count, self._limit)
         self._suspect: int | None = None
         """The number of next addresses of which at least one should be unreadable."""
 
-    def changed(self, count: int, outcome: Outcome) -> int:
-        """Adapts the size after a read. Returns the new limit."""
+    @property
+    def _limit(self) -> int:
+        """The largest read, in multiples of the width."""
+        return self._found.limit // self._found.width
+
+    def changed(self, count: int, outcome: Outcome) -> None:
+        """Adapts the size after a read, and the limit of the area."""
         if outcome is not None:
             self._suspect = count
             self.count = count // 2
         elif self._suspect is None:
-            self.count = min(2 * count, self.limit)
+            self.count = min(2 * count, self._limit)
         elif self._suspect > count:
             self._suspect -= count
             self.count = max(1, self._suspect // 2)
         else:
             self._suspect = None
-            self.count = self.limit = min(self.limit, self._found.largest // self._width)
-        return self.limit
+            self._found.limit = min(self._found.limit, self._found.largest)
+            self.count = self._limit
 
 
 def run_sync(
@@ -685,6 +701,28 @@ async def run(survey: Survey, read: Callable[[Area, int, str], Awaitable[object]
     await carry_out_async(survey.steps(), answer)
 
 
+def read_in_parts(
+    read: Callable[[Area, int, str], list[int]], block: Probe, width: int
+) -> Iterator[tuple[Probe, list[int] | ModbusException]]:
+    """Reads a block that exists; halves what the device refuses, because it may take less at once.
+
+    Yields each part with its content, or with the exception of what can't be halved: an exception
+    other than 02 and 03, or `width` addresses.
+    """
+    try:
+        content = read(block.area, block.address, _kind(block))
+    except ModbusException as error:
+        half = block.count // 2 // width * width
+        if error.code not in REFUSALS or not half:
+            yield block, error
+            return
+        area, middle = block.area, block.address + half
+        yield from read_in_parts(read, Probe(area, block.address, half), width)
+        yield from read_in_parts(read, Probe(area, middle, block.count - half), width)
+    else:
+        yield block, content
+
+
 def _kind(probe: Probe) -> str:
     return f"{'bool' if probe.area in BIT_AREAS else 'uint16'}[{probe.count}]"
 
@@ -704,7 +742,7 @@ def _failure(error: ModbusError, survey: Survey) -> Failure:
     return failure
 
 
-def _add(ranges: list[range], first: int, count: int) -> None:
+def add_addresses(ranges: list[range], first: int, count: int) -> None:
     """Adds addresses to sorted ranges, and joins adjacent ranges."""
     stop = first + count
     begin = bisect.bisect_left(ranges, first, key=lambda each: each.stop)

@@ -8,8 +8,8 @@ list of tags that do not overlap, each with a confidence.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from holdfast.discovery import (
@@ -28,10 +28,10 @@ from holdfast.tags import Tag
 from holdfast.types import BIT_AREAS, SHORT_OF
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from holdfast.client import SyncClient
-    from holdfast.discovery.address_search import Survey
+    from holdfast.discovery.address_search import AreaMap, Survey
     from holdfast.discovery.byte_order_habits import Habit
     from holdfast.discovery.segments import Value
     from holdfast.discovery.sunspec import SunSpec
@@ -73,9 +73,9 @@ class Description:
     """As `device_search` has found it."""
     sunspec: SunSpec | None = None
     reads: dict[tuple[Area, range], list[list[int]]] = field(default_factory=dict)
-    """The contents of each range that was read, of every read."""
-    unread: dict[tuple[Area, range], str] = field(default_factory=dict)
-    """Ranges that exist but could not be read again, and why."""
+    """The contents of what one request has read, of every time."""
+    unread: dict[tuple[Area, str], list[range]] = field(default_factory=dict)
+    """Ranges that exist but could not be read again, by the reason."""
     seen: dict[Area, dict[int, int]] = field(default_factory=dict)
     """The contents that the survey read."""
     orders: Mapping[str, float] = field(default_factory=dict)
@@ -113,8 +113,16 @@ def describe(
 
     def read_sunspec(address: int, count: int) -> list[int]:
         most = survey.max_quantity or READ_LIMITS["holding_registers"]
-        extent = range(address, address + count)
-        return list(_contents(read_more, "holding_registers", extent, most))
+        stop = address + count
+        registers: list[int] = []
+        # No device takes less than a header, which is not there if it is refused.
+        for first in range(address, stop, most):
+            block = address_search.Probe("holding_registers", first, min(most, stop - first))
+            for _, content in address_search.read_in_parts(read_more, block, len(sunspec.HEADER)):
+                if isinstance(content, ModbusException):
+                    raise content
+                registers += content
+        return registers
 
     def search(area: Area, address: int, kind: str) -> None:
         content = read(area, address, kind)
@@ -125,24 +133,41 @@ def describe(
     address_search.run_sync(survey, search, progress)
     if progress is not None:
         progress(survey)
-    places = list(_places(found))
+    blocks = [(each, block) for each, extent in _places(found) for block in each.blocks(extent)]
     for turn in range(reads):
-        if turn and places:
+        if turn and blocks:
             time.sleep(every)
-        for area, extent, largest in places:
-            if (area, extent) in found.unread:
-                continue
-            try:
-                content = list(_contents(read_more, area, extent, largest))
-            except ModbusException as error:
-                found.unread[area, extent] = str(error)
-                found.reads.pop((area, extent), None)
-            else:
-                found.reads.setdefault((area, extent), []).append(content)
+        # What the device has refused is not asked again.
+        blocks = [
+            (each, part)
+            for each, block in blocks
+            for part in _read_again(found, read_more, each, block)
+        ]
 
 
-def _places(found: Description) -> Iterator[tuple[Area, range, int]]:
-    """The ranges to read, without those of SunSpec, and the largest read of their area."""
+def _read_again(
+    found: Description, read: Callable[[Area, int, str], list[int]], each: AreaMap, block: range
+) -> list[range]:
+    """Reads a block, and keeps the contents. Returns the parts in which it could be read."""
+    area = each.area
+    probe = address_search.Probe(area, block.start, len(block))
+    answers = list(address_search.read_in_parts(read, probe, each.width))
+    before = found.reads.pop((area, block), [])
+    parts = []
+    for probe, content in answers:
+        part = range(probe.address, probe.address + probe.count)
+        if isinstance(content, ModbusException):
+            ranges = found.unread.setdefault((area, str(content)), [])
+            address_search.add_addresses(ranges, part.start, len(part))
+            continue
+        known = slice(part.start - block.start, part.stop - block.start)
+        found.reads[area, part] = [*(old[known] for old in before), content]
+        parts.append(part)
+    return parts
+
+
+def _places(found: Description) -> Iterator[tuple[AreaMap, range]]:
+    """The ranges to describe, without those of SunSpec."""
     known = found.sunspec.extent if found.sunspec is not None else range(0)
     for each in found.survey.areas:
         for extent in each.ranges:
@@ -153,17 +178,24 @@ def _places(found: Description) -> Iterator[tuple[Area, range, int]]:
                 parts = [before, behind]
             for part in parts:
                 if len(part):
-                    yield each.area, part, max(1, each.largest)
+                    yield each, part
 
 
-def _contents(
-    read: Callable[[Area, int, str], list[int]], area: Area, extent: range, largest: int
-) -> Iterator[int]:
-    kind = "bool" if area in BIT_AREAS else "uint16"
-    step = min(largest, READ_LIMITS[area])
-    for first in range(extent.start, extent.stop, step):
-        count = min(step, extent.stop - first)
-        yield from read(area, first, f"{kind}[{count}]")
+def _without(
+    found: Description, known: Iterable[tuple[Area, range]]
+) -> Iterator[tuple[AreaMap, range]]:
+    """What there is to describe, without what is known."""
+    joined: dict[Area, list[range]] = {}
+    for area, extent in known:
+        address_search.add_addresses(joined.setdefault(area, []), extent.start, len(extent))
+    for each, extent in _places(found):
+        first = extent.start
+        for other in joined.get(each.area, ()):
+            if first < min(other.start, extent.stop):
+                yield each, range(first, min(other.start, extent.stop))
+            first = max(first, other.stop)
+        if first < extent.stop:
+            yield each, range(first, extent.stop)
 
 
 def conclude(found: Description, now: float | None = None, seconds: float | None = None) -> None:
@@ -174,15 +206,16 @@ def conclude(found: Description, now: float | None = None, seconds: float | None
     """
     end = None if seconds is None else time.monotonic() + seconds
     most = MAX_REGISTERS_AT_ONCE if end is None else MAX_REGISTERS_IN_A_HURRY
-    for area, extent, _ in _places(found):
-        if (area, extent) not in found.reads and (area, extent) not in found.unread:
-            found.reads[area, extent] = [[found.seen[area][each] for each in extent]]
+    unread = ((area, each) for (area, _), ranges in found.unread.items() for each in ranges)
+    for each, extent in list(_without(found, (*found.reads, *unread))):
+        for block in each.blocks(extent):
+            found.reads[each.area, block] = [[found.seen[each.area][at] for at in block]]
     areas = [each.area for each in found.survey.areas]
     if found.sunspec is not None:
         found.tags += sunspec_tags.tags_of(found.sunspec)
-    for (area, extent), contents in found.reads.items():
-        if area in BIT_AREAS:
-            found.tags += _bits(area, extent, contents)
+    for whole in _joined(found):
+        if whole.area in BIT_AREAS:
+            found.tags += _bits(whole, found.survey.areas[areas.index(whole.area)].limit)
     try:
         pieces = list(_pieces(found))
         habits = _habits(pieces, now)
@@ -195,22 +228,11 @@ def conclude(found: Description, now: float | None = None, seconds: float | None
 
 
 def undescribed(found: Description) -> Iterator[tuple[Area, range]]:
-    """The ranges that were found and have no tags, because `conclude` ended early."""
-    ends = {(each.tag.area, each.tag.address): each.tag.end for each in found.tags}
-    for area, extent, _ in _places(found):
-        if (area, extent) in found.unread:
-            continue
-        first = at = extent.start
-        while at < extent.stop:
-            end = ends.get((area, at))
-            if end is None:
-                at += 1
-                continue
-            if first < at:
-                yield area, range(first, at)
-            first = at = end
-        if first < extent.stop:
-            yield area, range(first, extent.stop)
+    """The ranges that were found and have no tags: they could not be read again, or `conclude`
+    ended early.
+    """
+    tags = ((each.tag.area, range(each.tag.address, each.tag.end)) for each in found.tags)
+    return ((each.area, extent) for each, extent in _without(found, tags))
 
 
 @dataclass(frozen=True)
@@ -222,29 +244,64 @@ class _Piece:
     reads: list[list[int]]
     is_empty: bool
 
+    @property
+    def stop(self) -> int:
+        """The address behind the piece."""
+        return self.address + len(self.reads[0])
+
     def part(self, first: int, stop: int) -> _Piece:
         """Some of the registers."""
         reads = [read[first:stop] for read in self.reads]
         return replace(self, address=self.address + first, reads=reads)
 
 
+def _joined(found: Description) -> Iterator[_Piece]:
+    """What was read, in ranges as long as possible, with the reads that are of a whole range."""
+    areas = [each.area for each in found.survey.areas]
+    piece: _Piece | None = None
+    for area, block in sorted(found.reads, key=lambda key: (areas.index(key[0]), key[1].start)):
+        contents = found.reads[area, block]
+        if piece is not None and (area, block.start) == (piece.area, piece.stop):
+            del piece.reads[len(contents) :]
+            for read, more in zip(piece.reads, contents, strict=False):
+                read += more
+            continue
+        if piece is not None:
+            yield piece
+        piece = _Piece(area, block.start, [[*read] for read in contents], is_empty=False)
+    if piece is not None:
+        yield piece
+
+
 def _pieces(found: Description) -> Iterator[_Piece]:
     """The registers that were read, divided where many contain nothing."""
-    for (area, extent), contents in found.reads.items():
-        if area in BIT_AREAS:
+    maps = {each.area: each for each in found.survey.areas}
+    for whole in _joined(found):
+        if whole.area in BIT_AREAS:
             continue
+        area = maps[whole.area]
+        # A device that takes less at once may also refuse other reads than those of before.
+        borders = [
+            block.start - whole.address
+            for of, block in found.reads
+            if of == area.area and area.takes_less
+        ]
         start = 0
-        for first, stop in (*_empty(contents), (len(extent), len(extent))):
-            whole = _Piece(area, extent.start, contents, is_empty=False)
+        size = len(whole.reads[0])
+        for first, stop in (*_empty(whole.reads, area.width), (size, size)):
             if start < first:
                 yield whole.part(start, first)
-            if first < stop:
-                yield replace(whole, is_empty=True).part(first, stop)
+            inside = sorted(each for each in borders if first < each < stop)
+            for one, other in pairwise((first, *inside, stop)):
+                if one < other:
+                    yield replace(whole, is_empty=True).part(one, other)
             start = stop
 
 
-def _empty(reads: list[list[int]]) -> Iterator[tuple[int, int]]:
-    """The runs of registers that contain nothing in any read."""
+def _empty(reads: list[list[int]], width: int) -> Iterator[tuple[int, int]]:
+    """The runs of registers that contain nothing in any read, and begin and end a multiple of the
+    width from the first register.
+    """
     first = 0
     size = len(reads[0])
     while first < size:
@@ -254,7 +311,7 @@ def _empty(reads: list[list[int]]) -> Iterator[tuple[int, int]]:
             while stop < size and all(read[stop] == content for read in reads):
                 stop += 1
         if stop - first >= MIN_GAP_REGISTERS:
-            yield first, stop
+            yield first + -first % width, stop - stop % width
         first = max(stop, first + 1)
 
 
@@ -330,18 +387,19 @@ def _described(piece: _Piece, value: Value, confidence: float) -> DescribedTag:
     return DescribedTag(tag, confidence, value.found, reasons)
 
 
-def _bits(area: Area, extent: range, contents: Sequence[Sequence[int]]) -> Iterator[DescribedTag]:
-    size = 1 if len(extent) <= SINGLE_BITS else MAX_BITS_PER_TAG
-    for first in range(0, len(extent), size):
-        count = min(size, len(extent) - first)
+def _bits(piece: _Piece, limit: int) -> Iterator[DescribedTag]:
+    total = len(piece.reads[0])
+    size = 1 if total <= SINGLE_BITS else min(MAX_BITS_PER_TAG, limit)
+    for first in range(0, total, size):
+        count = min(size, total - first)
         kind = "bool" if count == 1 else f"bool[{count}]"
         found = tuple(
             bool(read[first]) if count == 1 else [bool(bit) for bit in read[first : first + count]]
-            for read in contents
+            for read in piece.reads
         )
         reasons = ("changes",) if any(each != found[0] for each in found) else ()
-        address = extent.start + first
-        tag = Tag(f"{SHORT_OF[area]}_{address}", area, address, kind)
+        address = piece.address + first
+        tag = Tag(f"{SHORT_OF[piece.area]}_{address}", piece.area, address, kind)
         yield DescribedTag(tag, 1.0, found, reasons)
 
 

@@ -129,8 +129,13 @@ class SunSpec:
 
     base: int
     models: tuple[Model, ...]
-    is_complete: bool
-    """Whether the end of the models was found."""
+    flaw: str | None = None
+    """Why the end of the models was not found; `None` if it was."""
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the end of the models was found."""
+        return self.flaw is None
 
     @property
     def extent(self) -> range:
@@ -170,18 +175,20 @@ def _models(read: Read, base: int, stop: int) -> SunSpec:
         try:
             number, length = read(at, 2)
             if number == END:
-                return SunSpec(base, tuple(models), is_complete=True)
+                return SunSpec(base, tuple(models))
             if not length or at + 2 + length > stop:
-                break  # No model is empty: these are not headers of models.
+                # No model is empty: these are not headers of models.
+                return SunSpec(base, tuple(models), f"{length} registers of a model at {at}")
             known = str(number) in definitions()
             registers = _block(read, at + 2, length) if known else []
             models.append(_model(number, at, length, registers))
         except ConnectFailed:
             raise
-        except ModbusError:  # Also the limit of requests: the models before it are complete.
-            break
+        except ModbusError as error:
+            # Also the limit of requests: the models before it are complete.
+            return SunSpec(base, tuple(models), f"{error}, of the model at {at}")
         at += 2 + length
-    return SunSpec(base, tuple(models), is_complete=False)
+    return SunSpec(base, tuple(models), f"no model is read from {at} on")
 
 
 def _block(read: Read, address: int, count: int) -> list[int]:

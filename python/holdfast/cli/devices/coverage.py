@@ -9,7 +9,7 @@ from holdfast.cli import terminal_text
 from holdfast.discovery.address_search import NEAR
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from holdfast.discovery.address_search import AreaMap, Failure, Survey
 
@@ -79,13 +79,17 @@ def failures(survey: Survey) -> list[str]:
             lines.append(f"{found.area}: {_words(survey, found.given_up)}; area skipped")
             continue
         for failure, ranges in found.failures.items():
-            where = ", ".join(
-                str(each.start) if len(each) == 1 else f"{each.start}-{each.stop - 1}"
-                for each in ranges[:8]
-            )
-            more = f", and {len(ranges) - 8} more" if len(ranges) > 8 else ""
-            lines.append(f"{found.area}: {_words(survey, failure)} at {where}{more}")
+            lines.append(f"{found.area}: {_words(survey, failure)} at {shown(ranges)}")
     return lines
+
+
+def shown(ranges: Sequence[range]) -> str:
+    """The first ranges, and how many more there are."""
+    where = ", ".join(
+        str(each.start) if len(each) == 1 else f"{each.start}-{each.stop - 1}"
+        for each in ranges[:8]
+    )
+    return where + (f", and {len(ranges) - 8} more" if len(ranges) > 8 else "")
 
 
 def _words(survey: Survey, failure: Failure) -> str:

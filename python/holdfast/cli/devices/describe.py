@@ -139,7 +139,8 @@ def describe(
     what has no tags yet. A second one ends the command at once. FILE is replaced as a whole, or
     not at all. If it can't be written at the end, the tag list is printed.
 
-    Exit codes: 0 done; 1 no unit id answered, or the search ended early; 2 wrong usage.
+    Exit codes: 0 done; 1 no unit id answered, the search ended early, or not all that was found
+    could be read again; 2 wrong usage.
     """
     is_line = isinstance(parse(url), SerialTarget)
     asked = units or (LINE_UNITS if is_line else UNITS)
@@ -196,6 +197,14 @@ class _Run:
     def _to_describe(self) -> list[Unit]:
         return self._answering[:1] if self._ignores else self._answering
 
+    @property
+    def _unread(self) -> Ended | None:
+        units = [each.unit for each in self._found if each.unread]
+        if not units:
+            return None
+        detail = f"of unit ids {number_ranges(units)}, not all that was found could be read again"
+        return Ended("exception", detail)
+
     def carry_out(self, client: SyncClient, *, is_line: bool) -> Ended | None:
         """Asks unit ids, and describes those that answer. Returns why it ended early, or `None`."""
         why = self._attempt(lambda: self._ask(client, is_line=is_line))
@@ -211,7 +220,7 @@ class _Run:
             why = self._conclude(unit, self._attempt(partial(self._describe, unit, client)))
             if why is not None:
                 break
-        unwritten = self._unwritten
+        unwritten = self._unwritten or self._unread
         if why is not None and unwritten is not None:
             return replace(why, detail=f"{why}; {unwritten}")
         if why is not None:

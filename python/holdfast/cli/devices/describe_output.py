@@ -59,7 +59,8 @@ def head_lines(found: Description) -> list[str]:
         models = ", ".join(
             f"{each.id} {each.label or '(unknown here)'}" for each in found.sunspec.models
         )
-        end = "" if found.sunspec.is_complete else "; the end of the models was not found"
+        flaw = found.sunspec.flaw
+        end = "" if flaw is None else f"; the end of the models was not found: {flaw}"
         lines.append(f"SunSpec at {found.sunspec.base}: models {models or 'none'}{end}")
     return lines
 
@@ -75,8 +76,8 @@ def described_lines(found: Description, most: int | None) -> list[str]:
     tags = terminal_text.table(head, rows[:most], "<<><<><>") if rows else []
     if most is not None and len(rows) > most:
         tags.append(f"and {len(rows) - most} more lines; --all shows them")
-    for (area, extent), error in found.unread.items():
-        tags.append(f"{area} {extent.start}-{extent.stop - 1} could not be read again: {error}")
+    for (area, error), ranges in found.unread.items():
+        tags.append(f"{area}: {error} when read again, at {coverage.shown(ranges)}")
     counts = [*coverage.counts(found.survey), *coverage.incomplete(found.survey)]
     left = [f"{area} {span.start}-{span.stop - 1}" for area, span in undescribed(found)]
     if left:
@@ -190,6 +191,7 @@ def sunspec_to_json(found: SunSpec) -> dict[str, object]:
     return {
         "base": found.base,
         "complete": found.is_complete,
+        "flaw": found.flaw,
         "models": [
             {"id": each.id, "name": each.name, "address": each.address, "length": each.length}
             for each in found.models

@@ -27,16 +27,19 @@ from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
 from holdfast.cli.terminal_text import print_json
 from holdfast.discovery import address_search
-from holdfast.errors import ModbusError
+from holdfast.discovery.address_search import Probe
+from holdfast.errors import ModbusError, ModbusException
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from holdfast.cli.live.changes import Change
     from holdfast.cli.live.sources import Source
     from holdfast.cli.options.plc_addresses import Place
     from holdfast.cli.tags.options import Selection, TagFiles
+    from holdfast.client import SyncClient
+    from holdfast.discovery.address_search import AreaMap
 
 TOKEN = "HOLDFAST_TOKEN"
 
@@ -149,24 +152,38 @@ def _device(
         return sources.DeviceSource(where, url, client, [block])
     survey = address_search.Survey(dense=False)
     click.echo(f"{where}: searching for addresses", err=True)
+    blocks: list[WatchedRange] = []
     try:
         with bar("Mapping", survey.total, lambda: f"{survey.requests} requests") as advance:
             address_search.run_sync(
                 survey, client.read, advance and (lambda survey: advance(survey.at))
             )
+        for found in survey.areas:
+            blocks += [
+                WatchedRange(None, unit, found.area, part.address, part.count)
+                for extent in found.ranges
+                for part in _parts(client, found, extent)
+            ]
     except ModbusError as error:
         client.close()
         device_errors.fail(error, url, {"target": url} if as_json else None)
-    blocks = [
-        WatchedRange(None, unit, found.area, each.start, len(each))
-        for found in survey.areas
-        for each in found.ranges
-    ]
     if not blocks:
         client.close()
         answer = {"target": url} if as_json else None
         device_errors.fail("no address was found", url, answer)
     return sources.DeviceSource(where, url, client, blocks)
+
+
+def _parts(client: SyncClient, found: AreaMap, extent: range) -> Iterator[Probe]:
+    """A range, in parts that the device returns, if it takes less at once than the standard."""
+    if not found.takes_less:
+        yield Probe(found.area, extent.start, len(extent))
+        return
+    for block in found.blocks(extent):
+        probe = Probe(found.area, block.start, len(block))
+        for part, content in address_search.read_in_parts(client.read, probe, found.width):
+            if not isinstance(content, ModbusException):
+                yield part
 
 
 def _appliance(
