@@ -87,6 +87,13 @@ def test_groups_in_groups_are_as_many_as_points_say() -> None:
     assert (last.value, last.scale, last.can_be_written) == (-3000, 0.01, True)
 
 
+def test_a_name_does_not_depend_on_how_many_a_device_has() -> None:
+    fixed = [1, 0, 0, 1, 1, 0, 0, 0, 0, 1, 0, 0, 0]
+    found = points([705, 25, *fixed, *[1, 1, 1, 1000, 1000, 0, 5, 0, 10, 1, 920, 3000]])
+    assert [name for name in found if name.endswith("_V")] == ["Crv_1_Pt_1_V"]
+    assert set(found) < set(points(sunspec_device.curves()))
+
+
 def test_a_model_that_is_not_known_has_no_points() -> None:
     registers = sunspec_device.registers([64999, 3, 1, 2, 3], sunspec_device.inverter())
     found = sunspec.find(reader(registers))

@@ -249,6 +249,7 @@ class _Group:
     def _repeat(self, definition: Mapping[str, Any]) -> None:
         """Adds the repetitions of a group: a number, as many as a point says, or as many as fit."""
         count = definition.get("count", 1)
+        is_single = count == 1
         if isinstance(count, str):
             _, found = self._number(count) or (0, 0)
             count = 0 if found == 0xFFFF else found
@@ -257,7 +258,8 @@ class _Group:
             fits = count == 0
         index = 1
         while self.stop < len(self.registers) and (fits or index <= count):
-            name = definition["name"] if count == 1 else f"{definition['name']}_{index}"
+            # Names have a number wherever devices differ in how many there are.
+            name = definition["name"] if is_single else f"{definition['name']}_{index}"
             prefix = f"{self.prefix}{name}_"
             group = _Group(definition, self.registers, self.address, self.stop, prefix, self)
             if group.stop == self.stop:
