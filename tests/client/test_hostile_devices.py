@@ -499,6 +499,24 @@ def test_a_reply_may_come_byte_by_byte(kind: str, make: Make, dial: Dial) -> Non
     assert client.read_holding_registers(7, 2) == [1, 2]
 
 
+# Before
+
+
+@pytest.mark.parametrize("kind", LINES)
+def test_what_came_before_a_line_was_opened_is_discarded(kind: str, make: Make) -> None:
+    device = make(kind)
+    assert isinstance(device, Serial)
+    mode = lines.RTU if kind == "rtu" else lines.ASCII
+    os.write(device.terminal.end, mode.frame(bytes.fromhex("0302 0009"), 1))
+    wire.until(lambda: device.terminal.waiting() > 0, "the frame has come")
+    bytes_by_way: list[str] = []
+
+    with holdfast.SyncClient(device.url, trace=lambda way, _: bytes_by_way.append(way)) as plc:
+        assert plc.read_holding_registers(7, 1) == [7]
+
+    assert bytes_by_way[0] == "sent"
+
+
 # Ends
 
 

@@ -93,6 +93,8 @@ impl SerialLine {
         let lock = lock(&self.device, User::Client)?;
         let set = |settings: Settings| self.set(settings);
         let port = serial2::SerialPort::open(&self.device, set)?;
+        // What came before is no reply, and would be judged as one that nobody asked for.
+        port.discard_input_buffer()?;
         self.set_direction(|mode| set_mode(&port, mode))?;
         Ok(OpenLine { port, device: self.device.clone(), lock })
     }

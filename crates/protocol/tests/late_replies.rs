@@ -6,7 +6,7 @@
 use std::time::Duration;
 
 use holdfast_protocol::client::{
-    Attempt, Closed, Connection, Done, Failure, Strays, Tolerance, Transport,
+    Attempt, Closed, Connection, Done, Failure, InvalidResponse, Strays, Tolerance, Transport,
 };
 use holdfast_protocol::frame::{ascii, mbap, rtu};
 use holdfast_protocol::pdu::{EncodedRequest, Range, Request, Response};
@@ -664,6 +664,8 @@ fn a_fast_reply_on_a_line_that_brings_others_is_not_believed() {
     assert_eq!(found.unwrap(), [3, 2, 0, 100]);
 }
 
+const TOO_FAST: Failure = Failure::Invalid(InvalidResponse::TooFast);
+
 /// The first reply of these is slow enough, so that it does not show that the line is fast, and comes twice.
 const FIRST_SLOW_AND_TWICE: Vice =
     |number, _| if number == 0 { vec![30 * MS, 31 * MS] } else { vec![MS] };
@@ -681,6 +683,40 @@ fn equal_fast_replies_are_believed_after_two_requests_without_another() {
     let mut world = World::new(SERIAL[0], FIRST_SLOW_AND_TWICE);
     world.connection = Connection::new(SERIAL[0]).on_line(MS);
     let found: Vec<_> = (1..=5).map(|_| world.read(1, 100)).collect();
-    let lost = Err(Failure::Timeout);
+    let lost = Err(TOO_FAST);
     assert_eq!(found, [Ok(100), lost, lost, Ok(100), Ok(100)]);
+}
+
+/// A line of 1 ms for a character, which has brought eight replies in time, and then one late.
+fn after_a_late_reply(vice: Vice) -> World {
+    let mut world = World::new(SERIAL[0], vice);
+    world.connection = Connection::new(SERIAL[0]).on_line(MS);
+    assert!((0..8).all(|address| world.read(1, address) == Ok(address)));
+    assert_eq!(world.read(1, 8), Err(Failure::Timeout));
+    world
+}
+
+#[test]
+fn shorter_reads_that_are_answered_do_not_hide_that_longer_ones_come_too_fast() {
+    // 60 registers take 133 ms, the others 15 ms.
+    let mut world = after_a_late_reply(|number, _| vec![if number == 8 { 320 } else { 40 } * MS]);
+    let mut long = Vec::new();
+    for _ in 0..4 {
+        assert_eq!(world.read(1, 7), Ok(7));
+        long.push(world.read_some(1, 100, 60));
+    }
+    assert_eq!(long, [Err(TOO_FAST), Err(TOO_FAST), Ok(100), Ok(100)]);
+}
+
+#[test]
+fn a_read_that_is_as_long_and_takes_its_time_shows_that_the_line_is_not_faster() {
+    let mut world = after_a_late_reply(|number, _| match number {
+        8 => vec![320 * MS],
+        10 | 12 | 14 => vec![30 * MS],
+        _ => vec![140 * MS],
+    });
+    for _ in 0..3 {
+        assert_eq!(world.read_some(1, 100, 60), Ok(100));
+        assert_eq!(world.read_some(1, 100, 60), Err(TOO_FAST));
+    }
 }

@@ -46,9 +46,6 @@ const MAX_GUARD: Duration = GUARD.saturating_mul(10);
 /// doubted until one comes that nobody asked for.
 const MAX_WRONG_DOUBTS: u32 = 8;
 
-/// Requests in a row that have no other reply than one that comes too fast, after which none is too fast.
-const MAX_TOO_FAST_IN_A_ROW: u8 = 2;
-
 /// Replies that are compared with the next one.
 const MAX_RECENT_REPLIES: usize = 16;
 
@@ -77,10 +74,9 @@ pub(super) struct LateReplies {
     is_fast: bool,
     /// A late reply has come.
     has_late: bool,
-    /// A reply to the request came too fast.
-    too_fast: bool,
-    /// Requests in a row that had no other reply than one that came too fast.
-    only_too_fast: u8,
+    /// What a request and its reply need on the line, of which no other came than one that was too fast. None
+    /// that need as long have come since.
+    only_too_fast: Option<Duration>,
     /// Reads in a row whose echo came before their reply. Here because a new connection keeps it.
     pub(super) echoes: u8,
     /// The newest first.
@@ -206,19 +202,18 @@ impl LateReplies {
         self.is_fast
     }
 
-    /// Notes that the reply to a request came too fast to be its own.
-    pub(super) fn came_too_fast(&mut self) {
-        self.too_fast = true;
-        self.stray(Duration::ZERO);
+    /// Notes that a request timed out whose only reply came too fast: the line needs this time for both. A copy
+    /// of an earlier reply would have been followed by its own: if none is, twice, the line is faster than its
+    /// settings say, as one over USB or a network is.
+    pub(super) fn only_too_fast(&mut self, needs: Duration) {
+        self.is_fast |= self.only_too_fast.is_some();
+        self.only_too_fast = Some(needs);
     }
 
-    /// Notes that a request timed out. A copy of an earlier reply that came too fast would have been followed
-    /// by its own: if none is, time and again, the line is faster than its settings say, as one over USB or a
-    /// network is.
-    fn timed_out(&mut self) {
-        self.only_too_fast = if self.too_fast { self.only_too_fast + 1 } else { 0 };
-        self.is_fast |= self.only_too_fast >= MAX_TOO_FAST_IN_A_ROW;
-        self.too_fast = false;
+    /// Notes a reply that did not come too fast, which needs this time with its request. It shows nothing for those
+    /// that need more: the unit itself may take so long.
+    pub(super) fn not_too_fast(&mut self, needs: Duration) {
+        self.only_too_fast = self.only_too_fast.filter(|more| needs < *more);
     }
 
     /// Notes a reply that nobody asked for, this time after the last one.
@@ -294,9 +289,6 @@ impl LateReplies {
         how: Ended,
         now: Time,
     ) {
-        if how == Ended::TimedOut {
-            self.timed_out();
-        }
         let until = self.until_after(unit_id, (sent, timeout), how, now);
         if until <= now {
             self.never_came.extend(request.pdu().first().map(|function| (unit_id, *function)));
@@ -394,7 +386,6 @@ impl LateReplies {
     pub(super) fn answered(&mut self, unit_id: u8, took: Duration, timeout: Duration) {
         self.guard.has_begun = true;
         self.guard.clean = self.guard.clean.saturating_add(1);
-        (self.too_fast, self.only_too_fast) = (false, 0);
         self.lateness.answered(unit_id, took, timeout);
     }
 }

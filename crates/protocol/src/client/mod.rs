@@ -148,6 +148,9 @@ pub enum InvalidResponse {
     /// Bytes without a request.
     #[error("bytes without a request")]
     Unrequested,
+    /// A reply that came sooner than the line can carry it, and no other.
+    #[error("the reply came sooner than the baud of the line allows")]
+    TooFast,
     /// Many more bytes without a request than a faulty device sends.
     #[error("a flood of bytes without a request")]
     Flood,
@@ -171,6 +174,7 @@ impl InvalidResponse {
             InvalidResponse::Datagram => "datagram",
             InvalidResponse::TooLong => "too_long",
             InvalidResponse::Unrequested => "unrequested",
+            InvalidResponse::TooFast => "too_fast",
             InvalidResponse::Flood => "flood",
         }
     }

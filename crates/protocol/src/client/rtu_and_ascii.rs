@@ -40,6 +40,8 @@ pub(super) struct OneAtATime {
     pub(super) late_replies: LateReplies,
     /// The time of a character on a serial line; 0 elsewhere.
     pub(super) character: Duration,
+    /// What the line needs for the request and a reply to it that came sooner, and was dropped.
+    too_fast: Option<Duration>,
     /// The timeout that the request was given: its own may be longer.
     timeout: Duration,
     /// The request is not sent before: what it waits for is a pause.
@@ -99,6 +101,7 @@ impl OneAtATime {
             echo,
             late_replies: LateReplies::default(),
             character: Duration::ZERO,
+            too_fast: None,
             timeout: Duration::ZERO,
             start: Time::ZERO,
             repeats: false,
@@ -140,7 +143,7 @@ impl OneAtATime {
         let len = len.expect("an encoded request has 1 to 253 bytes, which fit into every frame");
         self.frame.extend_from_slice(&room[..len]);
         self.received.clear();
-        self.stray = None;
+        (self.stray, self.too_fast) = (None, None);
         (self.timeout, self.start) = (timeout, start);
         // The reply to the same request, sent before by the same call, is as good.
         self.repeats = attempt != Attempt::default();
@@ -372,7 +375,8 @@ impl OneAtATime {
             flights.strays.replies += 1;
             flights.strays.bytes += self.reply_len(pdu.len()) as u64;
             self.received.clear();
-            return self.late_replies.came_too_fast();
+            self.too_fast = Some(self.needed(pdu.len()));
+            return self.late_replies.stray(Duration::ZERO);
         }
         let behind = core::mem::replace(&mut self.behind, Behind::NoFrame);
         let is_like_echo = self.is_like_echo(flights, &pdu);
@@ -413,8 +417,13 @@ impl OneAtATime {
     /// Whether the line can't have carried the request and its reply by now.
     fn is_too_fast(&mut self, flights: &Flights, pdu_len: usize, now: Time) -> bool {
         let Some(flight) = flights.first() else { return false };
-        let least = self.character * (self.frame.len() + self.reply_len(pdu_len)) as u32;
-        now.saturating_sub(flight.sent) < least && !self.late_replies.is_fast_line()
+        let took = now.saturating_sub(flight.sent);
+        took < self.needed(pdu_len) && !self.late_replies.is_fast_line()
+    }
+
+    /// The time that the line needs for the request and its reply.
+    fn needed(&self, pdu_len: usize) -> Duration {
+        self.character * (self.frame.len() + self.reply_len(pdu_len)) as u32
     }
 
     /// The length of the frame of a reply.
@@ -503,6 +512,7 @@ impl OneAtATime {
             return self.invalid(flights, invalid, now, sink);
         }
         let doubted = matches!(self.state, State::Doubting { .. });
+        self.late_replies.not_too_fast(self.needed(pdu.len()));
         if let Some(flight) = flights.first() {
             let request = (flight.unit_id, flight.request.pdu());
             self.late_replies.believed(request, pdu, doubted, now);
@@ -570,6 +580,9 @@ impl OneAtATime {
         if let (State::Sent { echoed }, Some(flight)) = (self.state, flights.first()) {
             let times = (flight.sent, self.timeout);
             self.late_replies.ended((flight.unit_id, &flight.request), times, how, now);
+            if let (Ended::TimedOut, Some(needed)) = (how, self.too_fast) {
+                self.late_replies.only_too_fast(needed);
+            }
             // A reply came without the echo that was expected.
             let is_mute = self.received.is_empty();
             if how == Ended::TimedOut && !echoed && !is_mute && !is_no_reply(flight) {
@@ -648,7 +661,8 @@ impl OneAtATime {
         if let Some(flight) = flights.expired(now) {
             let sent = !matches!(self.state, State::Quieting { .. });
             self.rest(now);
-            let invalid = self.stray.map(InvalidResponse::Frame);
+            let too_fast = self.too_fast.map(|_| InvalidResponse::TooFast);
+            let invalid = too_fast.or(self.stray.map(InvalidResponse::Frame));
             let failure = match invalid {
                 Some(invalid) => Failure::Invalid(invalid),
                 // An earlier attempt was sent, and got no reply.
