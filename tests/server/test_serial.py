@@ -155,7 +155,10 @@ def test_a_pdu_is_answered_and_leaves_memory_as_its_vector_says(
     assert {area: plant.memory.read(area, 0, size) for area in AREAS} == expected
 
 
-@pytest.mark.parametrize("case", cases("frames.json"), ids=lambda case: case["pdu"])
+REQUESTS = [case for case in cases("frames.json") if int(case["pdu"][:2], 16) < 0x80]
+
+
+@pytest.mark.parametrize("case", REQUESTS, ids=lambda case: case["pdu"])
 def test_a_frame_is_served_as_its_vector_spells_it(case: dict[str, Any], start: Start) -> None:
     plant, unit, pdu = start(units={case["unit"]: "plant"}), case["unit"], case["pdu"]
     text: str = case[plant.line.mode.name]
@@ -187,6 +190,15 @@ def test_the_replies_of_other_units_are_passed_over(plant: Plant) -> None:
         plant.await_frames("other_unit", number)
 
     assert plant.serves()
+
+
+@pytest.mark.parametrize("unit", [0, UNIT], ids=["broadcast", "own"])
+def test_an_exception_is_passed_over_whatever_its_unit(unit: int, plant: Plant) -> None:
+    plant.line.send(plant.line.mode.frame(b"\x83\x02", unit))
+    plant.await_frames("other_unit", 1)
+
+    assert plant.serves()
+    assert plant.counters["requests"] == {3: 1}
 
 
 @pytest.mark.parametrize("unit", [0, UNIT, 9], ids=["broadcast", "own", "other"])

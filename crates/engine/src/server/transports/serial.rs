@@ -1,7 +1,7 @@
 //! Modbus on a serial line: one device, RTU or ASCII frames, one request at a time.
 //!
-//! The listener answers only frames for units that it serves, and ignores all others and damaged
-//! ones. Unit id 0 is the broadcast: every memory carries out the write, no unit replies. A lost
+//! The listener answers only frames for units that it serves, and ignores all others, damaged ones, and
+//! exceptions, which are never requests. Unit id 0 is the broadcast: every memory carries out the write, no unit replies. A lost
 //! device is opened again when it returns.
 
 use std::collections::VecDeque;
@@ -308,6 +308,11 @@ impl ModbusSerial {
         reply: &mut pdu::Buffer,
     ) -> Option<usize> {
         let Serving { context, running } = serving;
+        // The exception of another server, or a late echo. To answer it would go on without end.
+        if request.first().is_some_and(|code| code & 0x80 != 0) {
+            self.unit_server.counters.frames.other_unit.add();
+            return None;
+        }
         if unit_id == BROADCAST {
             self.broadcast(context, request).await;
             return None;
