@@ -4,10 +4,17 @@
 use std::time::Duration;
 
 use holdfast_protocol::frame::rtu_stream::{Next, Requests};
+use holdfast_protocol::pdu::{ExceptionCode, Request};
 use tokio::time::Instant;
 
 /// Added to the time that a reply takes on the line: adapters hold bytes back for up to 16 ms, in both directions.
 const DELAY: Duration = Duration::from_millis(40);
+
+/// How much later an echo may come over a network, to a serial server.
+const SLOW: Duration = Duration::from_millis(250);
+
+/// How long after a write that was taken for a slow echo a master that waits for its reply repeats it.
+const REPEATED_WITHIN: Duration = Duration::from_secs(3);
 
 /// The last reply, until a request has come, and whether the line has an echo.
 #[derive(Debug, Default)]
@@ -15,10 +22,25 @@ pub(super) struct LineEcho {
     sent: Vec<u8>,
     /// A reply that equals its request may come again as the next request.
     is_certain: bool,
+    /// No request has its form: it comes back only as its echo.
+    is_no_request: bool,
     until: Option<Instant>,
     /// Whether what has come since began before that.
     is_soon: bool,
     known: Known,
+    slow: Slow,
+}
+
+/// What came of a write that came again, later than an echo should, on a line of which nothing else is known. If
+/// it is an echo, its reply has one again, without end.
+#[derive(Debug, Default, Clone, Copy)]
+enum Slow {
+    #[default]
+    Nothing,
+    /// It was carried out.
+    Once,
+    /// The second time in a row it was taken for an echo.
+    Dropped,
 }
 
 /// What replies that differ from their requests have shown of the line.
@@ -33,31 +55,40 @@ enum Known {
 }
 
 impl LineEcho {
-    /// A reply is sent now, which takes so long on the line.
-    pub(super) fn sent(&mut self, request: &[u8], reply: &[u8], takes: Duration) {
+    /// A reply with this PDU is sent now, which takes so long on the line.
+    pub(super) fn sent(&mut self, request: &[u8], (reply, pdu): (&[u8], &[u8]), takes: Duration) {
         self.sent.clear();
         self.sent.extend_from_slice(reply);
         self.is_certain = request != reply;
+        let has_no_form = Request::parse(pdu) == Err(ExceptionCode::IllegalDataValue);
+        let is_exception = pdu.first().is_some_and(|code| code & 0x80 != 0);
+        self.is_no_request = self.is_certain && (has_no_form || is_exception);
         (self.until, self.is_soon) = (Some(Instant::now() + takes + DELAY), false);
     }
 
     /// The number of bytes at the start of what has been received that are the echo. A request may begin like
     /// it: while more bytes of it may come, that is open.
     pub(super) fn at_start_of(&mut self, received: &[u8], more_may_come: bool) -> usize {
+        self.judged(received, more_may_come, Instant::now())
+    }
+
+    fn judged(&mut self, received: &[u8], more_may_come: bool, now: Instant) -> usize {
         if self.sent.is_empty() || !received.starts_with(&self.sent) {
             return 0;
         }
         // It stays in time while the rest is waited for.
-        self.is_soon |= self.until.is_some_and(|until| Instant::now() <= until);
+        self.is_soon |= self.until.is_some_and(|until| now <= until);
         match Requests::default().next(received) {
             Next::Frame { len, .. } if len > self.sent.len() => return 0,
             Next::Incomplete if more_may_come => return 0,
             _ => {}
         }
         let is_echo = match self.known {
+            _ if self.is_no_request => true,
             Known::Echo => true,
             Known::NoEcho => self.is_certain && self.is_soon,
-            Known::Nothing | Known::EchoOnce => self.is_soon,
+            Known::Nothing | Known::EchoOnce if self.is_certain || self.is_soon => self.is_soon,
+            Known::Nothing | Known::EchoOnce => return self.slow_echo(now),
         };
         if self.is_certain && is_echo {
             self.known = Known::Echo;
@@ -65,6 +96,27 @@ impl LineEcho {
         let len = self.sent.len();
         self.sent.clear();
         if is_echo { len } else { 0 }
+    }
+
+    /// Judges a write that equals the last one and its reply, on a line of which nothing else is known.
+    fn slow_echo(&mut self, now: Instant) -> usize {
+        let within = |time| self.until.is_some_and(|until| now <= until + time);
+        self.slow = match self.slow {
+            Slow::Dropped if within(REPEATED_WITHIN) => {
+                // It had no reply that could come back: the master has repeated it.
+                self.known = Known::NoEcho;
+                Slow::Nothing
+            }
+            Slow::Once if within(SLOW) => Slow::Dropped,
+            _ if within(SLOW) => Slow::Once,
+            _ => Slow::Nothing,
+        };
+        if let Slow::Dropped = self.slow {
+            // It is kept, to be known when it comes again.
+            return self.sent.len();
+        }
+        self.sent.clear();
+        0
     }
 
     /// Whether these bytes are the start of an echo whose rest may come with the next packet.
@@ -75,6 +127,9 @@ impl LineEcho {
     /// A request has come, which is no echo. On a line that had an echo, it may have been damaged: such a line
     /// never counts as one without, or the echo of a write would be carried out as the next write.
     pub(super) fn request(&mut self) {
+        if !self.sent.is_empty() {
+            self.slow = Slow::Nothing;
+        }
         if self.is_certain && !self.sent.is_empty() {
             self.known = match self.known {
                 Known::Echo | Known::EchoOnce => Known::EchoOnce,
@@ -95,8 +150,15 @@ mod tests {
     const VALUE: &[u8] = &[7, 3, 2, 0, 9, 2, 2];
     const WRITE: &[u8] = &[7, 6, 0, 0, 0, 9, 3, 3];
 
+    /// The reply to a read of 24 coils, which may be a read itself.
+    const COILS: &[u8] = &[7, 1, 3, 0, 0, 1, 4, 4];
+
+    fn sent(echo: &mut LineEcho, request: &[u8], reply: &[u8], takes: Duration) {
+        echo.sent(request, (reply, &reply[1..reply.len() - 2]), takes);
+    }
+
     fn after(echo: &mut LineEcho, request: &[u8], reply: &[u8], received: &[u8]) -> usize {
-        echo.sent(request, reply, Duration::from_secs(3600));
+        sent(echo, request, reply, Duration::from_secs(3600));
         let len = echo.at_start_of(received, false);
         if len == 0 && !echo.begins_with(received) {
             echo.request();
@@ -123,7 +185,7 @@ mod tests {
     #[test]
     fn a_damaged_echo_does_not_show_that_there_is_none() {
         let mut echo = LineEcho::default();
-        echo.sent(READ, VALUE, Duration::ZERO);
+        sent(&mut echo, READ, VALUE, Duration::ZERO);
         assert_eq!(echo.at_start_of(&[0xFF, 7, 3], false), 0);
         assert_eq!(after(&mut echo, WRITE, WRITE, WRITE), WRITE.len());
         assert_eq!(after(&mut echo, READ, VALUE, VALUE), VALUE.len());
@@ -142,7 +204,7 @@ mod tests {
     fn a_confirmation_that_comes_back_is_an_echo_on_a_line_that_has_one() {
         let mut echo = LineEcho::default();
         assert_eq!(after(&mut echo, READ, VALUE, VALUE), VALUE.len());
-        echo.sent(WRITE, WRITE, Duration::ZERO);
+        sent(&mut echo, WRITE, WRITE, Duration::ZERO);
         echo.until = None;
         assert_eq!(echo.at_start_of(WRITE, false), WRITE.len());
     }
@@ -151,7 +213,7 @@ mod tests {
     fn before_that_is_known_it_is_an_echo_if_it_comes_soon() {
         let mut echo = LineEcho::default();
         assert_eq!(after(&mut echo, WRITE, WRITE, WRITE), WRITE.len());
-        echo.sent(WRITE, WRITE, Duration::ZERO);
+        sent(&mut echo, WRITE, WRITE, Duration::ZERO);
         echo.until = None;
         assert_eq!(echo.at_start_of(WRITE, false), 0);
     }
@@ -166,26 +228,81 @@ mod tests {
             pdu[21] = value;
             let mut request = [0; rtu::MAX_LEN];
             let len = rtu::encode(3, &pdu, &mut request).unwrap();
-            echo.sent(&request[..len], REPLY, Duration::from_secs(3600));
+            sent(&mut echo, &request[..len], REPLY, Duration::from_secs(3600));
             assert!((1..len).all(|part| echo.at_start_of(&request[..part], true) == 0));
             assert_eq!(echo.at_start_of(&request[..len], true), 0);
             assert_eq!(echo.at_start_of(&request[..len], false), 0);
             echo.request();
         }
-        echo.sent(READ, REPLY, Duration::from_secs(3600));
+        sent(&mut echo, READ, REPLY, Duration::from_secs(3600));
         assert_eq!(echo.at_start_of(REPLY, true), 0);
         assert_eq!(echo.at_start_of(REPLY, false), REPLY.len());
     }
 
     #[test]
-    fn what_is_certain_must_come_soon_unless_the_line_has_an_echo() {
+    fn what_may_be_a_request_must_come_soon_unless_the_line_has_an_echo() {
         let mut echo = LineEcho::default();
         for is_known in [false, true] {
-            echo.sent(READ, VALUE, Duration::ZERO);
+            sent(&mut echo, READ, COILS, Duration::ZERO);
             echo.until = None;
-            assert_eq!(echo.at_start_of(VALUE, false) > 0, is_known);
+            assert_eq!(echo.at_start_of(COILS, false) > 0, is_known);
             assert_eq!(after(&mut echo, READ, VALUE, VALUE), VALUE.len());
         }
+    }
+
+    #[test]
+    fn what_has_the_form_of_no_request_is_an_echo_however_late_it_comes() {
+        for reply in [VALUE, &[7, 0x83, 2, 5, 5]] {
+            let mut echo = LineEcho::default();
+            for _ in 0..2 {
+                sent(&mut echo, READ, reply, Duration::ZERO);
+                echo.until = None;
+                assert_eq!(echo.at_start_of(reply, false), reply.len());
+                assert_eq!(after(&mut echo, WRITE, WRITE, WRITE), WRITE.len(), "that is known now");
+                assert_eq!(after(&mut echo, READ, VALUE, READ), 0);
+            }
+        }
+    }
+
+    /// Sends `WRITE` so long after its reply would have come back. Returns whether it was carried out.
+    fn write(echo: &mut LineEcho, later: Duration) -> bool {
+        let now = echo.until.map_or_else(Instant::now, |until| until + later);
+        let is_echo = echo.judged(WRITE, false, now) > 0;
+        if !is_echo {
+            echo.request();
+            sent(echo, WRITE, WRITE, Duration::ZERO);
+        }
+        !is_echo
+    }
+
+    const MUCH_LATER: Duration = Duration::from_secs(3600);
+
+    #[test]
+    fn the_slow_echo_of_a_write_is_carried_out_once_at_most() {
+        let mut echo = LineEcho::default();
+        for _ in 0..3 {
+            let carried_out = [MUCH_LATER, SLOW, SLOW].map(|later| write(&mut echo, later));
+            assert_eq!(carried_out, [true, true, false]);
+        }
+    }
+
+    #[test]
+    fn a_master_that_repeats_a_write_is_answered_when_it_asks_again() {
+        let mut echo = LineEcho::default();
+        let later = [MUCH_LATER, SLOW, SLOW, REPEATED_WITHIN, SLOW, SLOW, SLOW, SLOW];
+        let carried_out = later.map(|later| write(&mut echo, later));
+        assert_eq!(carried_out, [true, true, false, true, true, true, true, true]);
+    }
+
+    #[test]
+    fn writes_between_others_or_after_a_while_are_no_slow_echo() {
+        let mut echo = LineEcho::default();
+        for later in [MUCH_LATER, SLOW, SLOW + Duration::from_millis(1), SLOW] {
+            assert!(write(&mut echo, later));
+        }
+        // A request to another unit has come.
+        echo.request();
+        assert!(write(&mut echo, SLOW) && write(&mut echo, SLOW));
     }
 
     #[test]
@@ -193,7 +310,7 @@ mod tests {
         let mut echo = LineEcho::default();
         assert_eq!(after(&mut echo, READ, VALUE, VALUE), VALUE.len());
         assert_eq!(after(&mut echo, READ, VALUE, WRITE), 0);
-        echo.sent(WRITE, WRITE, Duration::ZERO);
+        sent(&mut echo, WRITE, WRITE, Duration::ZERO);
         echo.until = None;
         assert_eq!(echo.at_start_of(WRITE, false), 0);
         assert_eq!(after(&mut echo, READ, VALUE, READ), 0);

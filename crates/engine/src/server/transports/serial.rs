@@ -200,11 +200,13 @@ impl ModbusSerial {
         };
         let answer = self.answer(serving, unit_id, request, buffer);
         let is_broadcast = unit_id == BROADCAST;
-        let Some(len) = unless_newer(answer, is_broadcast, Input::Rtu(line), port).await? else {
+        let Some(pdu_len) = unless_newer(answer, is_broadcast, Input::Rtu(line), port).await?
+        else {
             return Ok(());
         };
-        let len = Rtu::complete(&mut reply, 0, unit_id, len);
-        echo.sent(frame, &reply[..len], self.line.character() * len as u32);
+        let len = Rtu::complete(&mut reply, 0, unit_id, pdu_len);
+        let pdu = &reply[Rtu::HEADER_LEN..][..pdu_len];
+        echo.sent(frame, (&reply[..len], pdu), self.line.character() * len as u32);
         send(port, &reply[..len]).await
     }
 
@@ -289,9 +291,9 @@ impl ModbusSerial {
         let Some(len) = unless_newer(answer, is_broadcast, Input::Ascii(input), port).await? else {
             return Ok(());
         };
-        let mut reply = [0; ascii::MAX_LEN];
-        let Some(len) = ascii::encode(unit_id, &buffer[..len], &mut reply) else { return Ok(()) };
-        echo.sent(frame, &reply[..len], self.line.character() * len as u32);
+        let (pdu, mut reply) = (&buffer[..len], [0; ascii::MAX_LEN]);
+        let Some(len) = ascii::encode(unit_id, pdu, &mut reply) else { return Ok(()) };
+        echo.sent(frame, (&reply[..len], pdu), self.line.character() * len as u32);
         send(port, &reply[..len]).await
     }
 
