@@ -394,6 +394,7 @@ fn each_invalid_response_has_a_word_for_programs() {
         (InvalidResponse::Datagram, "datagram"),
         (InvalidResponse::TooLong, "too_long"),
         (InvalidResponse::Unrequested, "unrequested"),
+        (InvalidResponse::TooFast, "too_fast"),
     ] {
         assert_eq!(invalid.reason(), word);
     }
@@ -435,21 +436,77 @@ fn what_may_have_been_an_echo_is_no_reply_which_may_still_come() {
     assert_eq!(client.outgoing(), []);
 }
 
-#[test]
-fn noise_behind_a_reply_that_is_doubted_is_counted() {
-    let mut client = Client::new(RTU, Tolerance::default());
-    client.read_in_time(1, false);
+fn frame_of(transport: Transport, pdu: &[u8]) -> Vec<u8> {
+    let mut frame = [0; ascii::MAX_LEN];
+    match transport {
+        Transport::SerialAscii { .. } => {
+            let len = ascii::encode(7, pdu, &mut frame).unwrap();
+            frame[..len].to_vec()
+        }
+        _ => rtu_frame(pdu),
+    }
+}
+
+/// A connection that gets these bytes behind a reply, and more later. The reply equals the one before, to another
+/// request: it is believed if no other follows.
+fn with_what_follows_a_doubted_reply(transport: Transport, pad: bool, parts: [&[u8]; 2]) -> Client {
+    let mut client = Client::new(transport, Tolerance { pad, ..Tolerance::default() });
+    let reply = frame_of(transport, &[3, 2, 0, 1]);
+    client.send(&read(1));
+    client.after(30 * MS);
+    client.receive(&reply);
+    assert_eq!(client.got(), [Ok(vec![3, 2, 0, 1])]);
     client.after(SECOND / 10);
     let other = Request::ReadHoldingRegisters(Range::new(4, 1).unwrap());
     client.send(&EncodedRequest::new(&other));
     client.after(30 * MS);
-    client.receive(&rtu_frame(&[3, 2, 0, 1]));
+    client.receive(&[&reply, parts[0]].concat());
     assert_eq!(client.got(), []);
-    client.receive(&[7]);
-    client.receive(&[0]);
-    client.after(SECOND / 10);
-    assert_eq!(client.got(), [Ok(vec![3, 2, 0, 1])]);
-    assert_eq!(client.connection.take_strays(), Strays { replies: 0, bytes: 2 });
+    parts[1].iter().for_each(|byte| client.receive(&[*byte]));
+    client
+}
+
+#[test]
+fn noise_behind_a_reply_that_is_doubted_is_dropped_and_counted() {
+    let noise = [0xFF, 0, 0xFE, 0x80, 0xFF, 7];
+    let ascii = Transport::SerialAscii { silence: SILENCE };
+    for (transport, pad, parts) in [
+        (RTU, false, [&[][..], &[7, 3]]),
+        (RTU, false, [&[], &noise]),
+        (RTU, false, [&noise[..2], &noise[2..]]),
+        (ascii, false, [&[], b"0123456789"]),
+        (RTU, true, [&[], &[0; 20]]),
+        (Transport::RtuOverTcp, true, [&[], &[0; 20]]),
+    ] {
+        let mut client = with_what_follows_a_doubted_reply(transport, pad, parts);
+        client.after(SECOND / 10);
+        assert_eq!(client.got(), [Ok(vec![3, 2, 0, 1])], "{transport:?} {parts:?}");
+        let bytes = if pad { 0 } else { parts.concat().len() as u64 };
+        assert_eq!(client.connection.take_strays(), Strays { replies: 0, bytes });
+    }
+}
+
+#[test]
+fn what_may_be_another_reply_contradicts_one_that_is_doubted() {
+    let other = rtu_frame(&[3, 2, 0, 2]);
+    let damaged = [&[0], &other[1..]].concat();
+    let line = frame_of(Transport::SerialAscii { silence: SILENCE }, &[3, 2, 0, 2]);
+    let mut of_another_unit = [0; rtu::MAX_LEN];
+    let len = rtu::encode(9, &[0x83, 2], &mut of_another_unit).unwrap();
+    for (transport, pad, parts) in [
+        (RTU, false, [&[][..], &other[..3]]),
+        (RTU, false, [&[], &[0xFF, 0, 7, 3]]),
+        (RTU, true, [&[], &other[..3]]),
+        (RTU, false, [&other[..5], &other[5..]]),
+        (RTU, false, [&[], &damaged]),
+        (RTU, false, [&[], &of_another_unit[..len]]),
+        (Transport::SerialAscii { silence: SILENCE }, false, [&[], &line[..3]]),
+        (Transport::RtuOverTcp, false, [&[], &[0; 3]]),
+    ] {
+        let mut client = with_what_follows_a_doubted_reply(transport, pad, parts);
+        let unrequested = Failure::Invalid(InvalidResponse::Unrequested);
+        assert_eq!(client.got(), [Err(unrequested)], "{transport:?} {parts:?}");
+    }
 }
 
 #[test]

@@ -28,7 +28,8 @@ pub const TURNAROUND: Duration = Duration::from_millis(100);
 /// The exception of a gateway that has no reply yet: that of the device may follow.
 const GATEWAY_NO_REPLY: u8 = ExceptionCode::GatewayTargetFailedToRespond as u8;
 
-/// Bytes behind a reply that are no sign of another one: lines have some when a driver is switched off.
+/// Bytes behind a reply that are no sign of another one, whatever they are: lines have some when a driver is
+/// switched off.
 const MAX_NOISE_BYTES: usize = 2;
 
 #[derive(Debug)]
@@ -406,8 +407,8 @@ impl OneAtATime {
                 // The unit may take as long as usual.
                 false => flight.sent + self.late_replies.longest(flight.unit_id) * 2,
             });
+            // What came behind it is kept: another reply may have begun.
             (self.doubted, self.is_maybe_echo) = (Some((unit_id, pdu, now)), is_like_echo);
-            self.received.clear();
             self.state = State::Doubting { until: until.max(now + GUARD) };
             return;
         }
@@ -459,10 +460,25 @@ impl OneAtATime {
         if self.is_maybe_echo && self.frame.starts_with(&self.received) {
             return;
         }
-        flights.strays.bytes += bytes.len() as u64;
-        if self.received.len() > MAX_NOISE_BYTES {
+        if !flights.tolerance.pad {
+            flights.strays.bytes += bytes.len() as u64;
+        }
+        if self.received.len() > MAX_NOISE_BYTES && self.may_be_other_reply(flights) {
             self.contradicted(flights, now, sink);
         }
+    }
+
+    /// Whether the bytes after a reply that is doubted may be another one, whole, damaged or in part. A line has
+    /// noise, and some devices pad replies: these are shorter, or begin like none.
+    fn may_be_other_reply(&self, flights: &Flights) -> bool {
+        let (bytes, pads) = (&self.received, flights.tolerance.pad);
+        let len = self.doubted.as_ref().map_or(0, |(_, pdu, _)| self.reply_len(pdu.len()));
+        let is_as_long = !pads && (self.silence.is_none() || bytes.len() >= len);
+        let begins = |flight: &Flight| match self.framing {
+            Framing::Rtu => bytes.windows(2).any(|pair| fits(flights, flight, pair)),
+            Framing::Ascii => bytes.contains(&b':'),
+        };
+        is_as_long || is_frame(self.framing, bytes) || flights.first().is_some_and(begins)
     }
 
     /// Nothing followed what may have been an echo, so it is no reply. If it was one, the next is believed.
@@ -687,13 +703,11 @@ impl OneAtATime {
         if self.awaits_echo(flight) && !*echoed {
             return Ok(None);
         }
-        let request = flight.request.pdu();
         let mut failure = None;
         self.stray = None;
         for start in 0..self.received.len() {
             let bytes = &self.received[start..];
-            let fits = flights.tolerance.accept_unit.accepts(flight.unit_id, bytes[0])
-                && bytes.get(1).is_none_or(|code| code & 0x7F == request[0]);
+            let fits = fits(flights, flight, bytes);
             if start > 0 && !fits {
                 continue;
             }
@@ -703,7 +717,9 @@ impl OneAtATime {
                         let behind = bytes.len() - len;
                         self.behind = behind_reply(Framing::Rtu, &bytes[..len], &bytes[len..]);
                         let stray = if flights.tolerance.pad { start } else { start + behind };
-                        return Ok(Some(Reply::new(reply, stray)));
+                        let reply = Reply::new(reply, stray);
+                        self.received.drain(..start + len);
+                        return Ok(Some(reply));
                     }
                     Err(error) if fits => failure = failure.or(Some(error)),
                     Err(error) => self.stray = Some(error),
@@ -758,6 +774,12 @@ fn response_len(bytes: &[u8], request: &EncodedRequest) -> Result<Option<usize>,
         return Ok(rtu::decode(bytes).is_ok().then_some(bytes.len()));
     }
     rtu::response_len(bytes, pdu.len())
+}
+
+/// Whether an RTU reply to this request may begin with these bytes.
+fn fits(flights: &Flights, flight: &Flight, bytes: &[u8]) -> bool {
+    flights.tolerance.accept_unit.accepts(flight.unit_id, bytes[0])
+        && bytes.get(1).is_none_or(|code| code & 0x7F == flight.request.pdu()[0])
 }
 
 /// Whether the request itself, sent back, can't be taken for its reply.
