@@ -170,6 +170,8 @@ def test_a_port_that_is_taken_is_one_line_and_exit_code_1() -> None:
          "500ms, 2s or 2 (seconds): 0, or from 0.001, up to 31622400 s."),
         ([NOBODY, "--in-flight", "1025"], "Error: Invalid value for '--in-flight': '1025' is not "
          "auto or a number from 1 to 1024."),
+        (["rtu:///dev/none", "--in-flight", "4"], "Error: --in-flight 4 requires tcp or tls."),
+        (["udp://plc", "--in-flight", "4"], "Error: --in-flight 4 requires tcp or tls."),
         ([NOBODY, "--functions", "3,128"], "Error: Invalid value for '--functions': '128' is not "
          "a function code from 1 to 127."),
         ([NOBODY, "--functions", "3,3"], "Error: Invalid value for '--functions': function 3 is "

@@ -322,6 +322,19 @@ def test_settings_of_polling_have_no_effect_without_reads(folder: Folder, settin
     ]
 
 
+@pytest.mark.parametrize("url", ["rtu:///dev/none?baud=9600", "udp://a", "rtu+tcp://a"])
+@pytest.mark.parametrize(("number", "warns"), [("4", True), ("auto", False), ("1", False)])
+def test_what_carries_one_request_at_a_time_has_no_more_in_flight(
+    folder: Folder, url: str, number: str, *, warns: bool
+) -> None:
+    text = changed('"rtu:///dev/none?baud=9600"', f"{url!r}, in_flight: {number}")
+    expected = (
+        "p.yaml:5: links.bus.in_flight: has no effect: only tcp and tls carry more than one "
+        "request at a time"
+    )
+    assert folder.warnings(text) == ([expected] if warns else [])
+
+
 def test_reads_need_an_interval(folder: Folder) -> None:
     reads = READS.removeprefix("interval: 1, ")
     assert told(folder, changed("unit: 7}", f"unit: 7, {reads}}}")) == [

@@ -16,7 +16,7 @@ from holdfast.cli.options.url import checked_url
 from holdfast.cli.services.run import serve
 from holdfast.client.endpoint import endpoint
 from holdfast.client.serial_settings import SerialTarget
-from holdfast.client.url import parse
+from holdfast.client.url import IN_FLIGHT, parse
 from holdfast.config import Config
 from holdfast.config.values.scalars import MAX_TIME, MIN_TIME
 from holdfast.net.addresses import LOOPBACK, joined, reachable
@@ -110,6 +110,9 @@ def proxy(
     with usable():
         endpoint(target)
     _check(target, bind, sources, functions, unit, access)
+    one = isinstance(target, SerialTarget) or target.transport not in IN_FLIGHT
+    if one and in_flight not in (1, "auto"):
+        raise click.UsageError(f"--in-flight {in_flight} requires {' or '.join(IN_FLIGHT)}.")
     rule: dict[str, Any] = {
         "sources": list(sources or LOOPBACK),
         "access": access,

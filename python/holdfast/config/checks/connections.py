@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.client.serial_settings import SerialTarget
 from holdfast.client.tolerance import STRICT, Tolerance
-from holdfast.client.url import parse, parse_receiver
+from holdfast.client.url import IN_FLIGHT, parse, parse_receiver
 from holdfast.config.checks.common import check_readable, given, items, until_invalid
 from holdfast.config.models.devices import DeviceConfig, RetryConfig, tolerating
 from holdfast.config.models.listeners import (
@@ -83,6 +83,10 @@ class AddressChecks:
         """Checks a device or a link."""
         target = self._tolerance(path, parse(user.url), user)
         retry = _whole_retry(user)
+        one = isinstance(target, SerialTarget) or target.transport not in IN_FLIGHT
+        if one and user.in_flight not in (1, "auto"):
+            message = f"has no effect: only {' and '.join(IN_FLIGHT)} carry more than one request"
+            self.report.warn((*path, "in_flight"), f"{message} at a time")
         if isinstance(target, SerialTarget):
             self._line(path, target, retry, user)
             return
