@@ -438,6 +438,78 @@ def refuse_removals(stored: Stored) -> None:
     )
 
 
+def test_a_file_that_was_removed_is_written_anew_with_all_that_waits(
+    opened: Opened, tmp_path: Path
+) -> None:
+    """In its order, also what was taken; and what is sent does not return."""
+    file = tmp_path / "b.db"
+    (tmp_path / "b.db.new").write_text("left by a crash")
+    buffer = Buffer()
+    buffer.stored = opened(file)
+    for number in range(4):
+        buffer.offer(polls(1, number))
+        buffer.keep(60)
+    assert numbers(buffer.take(1, 0)) == [0]
+    buffer.done()
+    assert numbers(buffer.take(1, 0)) == [1]
+    assert not buffer.restore_file()
+    file.unlink()
+    assert not buffer.stored.is_in_place
+    assert buffer.restore_file()
+    assert (buffer.stored.is_in_place, buffer.stored.count, len(buffer)) == (True, 3, 3)
+    buffer.done()
+    buffer.offer(polls(1, 4))
+    buffer.keep(60)
+    buffer.detach()
+    assert [each.name for each in tmp_path.iterdir()] == ["b.db"]
+    again = Buffer()
+    again.stored = opened(file)
+    assert drained(again) == [2, 3, 4]
+
+
+def test_a_file_in_the_place_of_one_that_was_renamed_is_left_alone(
+    opened: Opened, tmp_path: Path
+) -> None:
+    file = tmp_path / "b.db"
+    buffer = Buffer()
+    stored = buffer.stored = opened(file)
+    stored.add([numbered(3)])
+    file.rename(tmp_path / "moved.db")
+    file.write_text("of another program")
+    with pytest.raises(OSError, match=r"b\.db: another file is in its place"):
+        buffer.restore_file()
+    assert numbers(buffer.take(9, 0)) == [0, 1, 2]
+    # If nothing can be removed, the file would go as a whole.
+    refuse_removals(stored)
+    with pytest.raises(OSError, match="is full"):
+        buffer.done()
+    assert file.read_text() == "of another program"
+
+
+def test_a_new_file_that_another_process_uses_is_opened_later(
+    opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "b.db"
+    buffer = Buffer()
+    stored = buffer.stored = opened(file)
+    stored.add([numbered(3)])
+    close = stored.close
+
+    def overtaken() -> None:
+        close()
+        opened(file)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(stored, "close", overtaken)
+        file.unlink()
+        with pytest.raises(FileGone, match="database is locked"):
+            buffer.restore_file()
+    assert (len(buffer), buffer.dropped) == (0, 0)
+    opened.all[-1].close()
+    buffer.stored = opened(file)
+    assert drained(buffer) == [0, 1, 2]
+
+
 def test_what_can_not_be_removed_is_not_sent_again(opened: Opened, tmp_path: Path) -> None:
     buffer = Buffer()
     stored = buffer.stored = opened(tmp_path / "b.db")

@@ -420,6 +420,40 @@ def test_a_file_that_is_opened_late_is_followed_by_the_last_values(tmp_path: Pat
     assert output.renewed == [None]
 
 
+def test_a_file_that_is_removed_in_an_outage_is_written_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = tmp_path / "b.db"
+    output = Running(file)
+    output.receiver.error = OSError("down")
+    output.buffer.offer(polls(3))
+    wire.until(lambda: getattr(output.buffer.stored, "count", 0) == 3, "it is stored")
+    file.unlink()
+    wire.until(lambda: count(caplog, "output_file_recreated") == 1, "it is logged")
+    output.end()
+    assert (count(caplog, "output_file_failed"), count(caplog, "output_unsent")) == (0, 0)
+    again = Running(file)
+    wire.until(lambda: again.receiver.sent == [0, 1, 2], "all is sent")
+    again.end()
+
+
+def test_what_is_lost_with_a_folder_that_was_removed_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = tmp_path / "removed"
+    folder.mkdir()
+    output = Running(folder / "b.db")
+    output.receiver.error = OSError("down")
+    output.buffer.offer(polls(3))
+    wire.until(lambda: getattr(output.buffer.stored, "count", 0) == 3, "it is stored")
+    folder.rename(tmp_path / "moved")
+    wire.until(lambda: count(caplog, "output_file_failed") == 1, "it is logged")
+    output.buffer.offer(polls(1, 3))
+    output.end()
+    [record] = [record for record in caplog.records if record.message == "output_unsent"]
+    assert vars(record)["fields"]["count"] == 4
+
+
 def test_a_file_from_which_nothing_can_be_removed_stops_nothing(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

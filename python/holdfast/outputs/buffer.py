@@ -142,6 +142,14 @@ class Buffer:
             self._is_woken = True
             self._changed.notify_all()
 
+    def restore_file(self) -> bool:
+        """Writes a file that was removed anew, with all that waits in it. Returns whether it was.
+
+        Raises `OSError` if that fails.
+        """
+        with self._losing_file():
+            return self.stored is not None and self.stored.restore()
+
     def keep(self, seconds: float, step: int = MAX_STEP) -> bool:
         """Moves what waits in memory now to the file, if there is one, `step` at a time. Returns
         whether anything was moved.

@@ -7,6 +7,7 @@ cost few writes.
 from __future__ import annotations
 
 import contextlib
+import os
 import sqlite3
 from typing import TYPE_CHECKING, Any
 
@@ -65,9 +66,16 @@ class Stored:
         """The rows that `first` returned last, and how many readings each has."""
         self._sent = 0
         """The last row that is sent. On a full disk, rows up to it are still in the file."""
-        with file_errors(file):
+        self._lock_timeout = lock_timeout
+        self._open()
+
+    def _open(self) -> None:
+        with file_errors(self.file):
             self._db = sqlite3.connect(
-                file, timeout=lock_timeout, isolation_level=None, check_same_thread=False
+                self.file,
+                timeout=self._lock_timeout,
+                isolation_level=None,
+                check_same_thread=False,
             )
         with self._errors(self.close):
             # A text that is not UTF-8 spoils only the row that needs it, in `first`.
@@ -82,6 +90,36 @@ class Stored:
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
             self._db.executescript(_CREATE)
             self._recount()
+            self._status = self.file.stat()
+
+    @property
+    def is_in_place(self) -> bool:
+        """Whether the file has not been removed or renamed since it was opened."""
+        return is_in_place(self.file, self._status)
+
+    def restore(self) -> bool:
+        """Writes the file anew, with all that waits, if it was removed. Returns whether it was."""
+        if self.is_in_place:
+            return False
+        if self.file.exists():
+            raise OSError(
+                f"{self.file}: another file is in its place. Move that one away, and all that waits"
+                " is written to a new file"
+            )
+        # After a crash, there is a whole file or none.
+        copy = self.file.with_name(f"{self.file.name}.new")
+        with file_errors(self.file):
+            copy.unlink(missing_ok=True)
+            with contextlib.closing(sqlite3.connect(copy)) as db:
+                self._db.backup(db)
+        copy.rename(self.file)
+        # First: it removes the journal, whose name is that of the journal of the new file.
+        self.close()
+        try:
+            self._open()
+        except OSError as error:
+            raise FileGone(str(error), 0) from error
+        return True
 
     def add(self, rows: Sequence[Sequence[Reading]]) -> int:
         """Stores rows of readings durably, all or none. Returns how many were dropped for want of
@@ -168,7 +206,7 @@ class Stored:
         except FileGone:
             raise
         except OSError as error:
-            if self.count:
+            if self.count or not self.is_in_place:
                 raise
             # A removal needs room for its journal, which a full disk does not have. A file in which
             # nothing waits can go as a whole, unless the disk can only be read.
@@ -316,6 +354,14 @@ def file_errors(file: Path, undo: Callable[[], object] = lambda: None) -> Iterat
         with contextlib.suppress(sqlite3.Error):
             undo()
         raise OSError(f"{file}: {error}") from error
+
+
+def is_in_place(file: Path, status: os.stat_result) -> bool:
+    """Whether a file is still the one that had this status."""
+    try:
+        return os.path.samestat(file.stat(), status)
+    except OSError:
+        return False
 
 
 def _stand_in(name: str, value: Any) -> Tag:

@@ -270,7 +270,8 @@ class Sending:
     def _log_unsent(self) -> None:
         """Logs what is lost."""
         stored = self._buffer.stored
-        unsent = len(self._buffer) - (0 if stored is None else stored.count)
+        kept = stored.count if stored is not None and stored.is_in_place else 0
+        unsent = len(self._buffer) - kept
         if unsent > 0:
             log_lines.write(logging.WARNING, "output_unsent", output=self._name, count=unsent)
 
@@ -288,6 +289,9 @@ class Sending:
 
     def _keep(self, seconds: float) -> None:
         with self._using_file():
+            if self._buffer.restore_file():
+                log_lines.write(logging.WARNING, "output_file_recreated", output=self._name)
+                self._file_error = None
             if self._buffer.keep(seconds):
                 self._file_error = None
 
@@ -318,7 +322,7 @@ class Sending:
 
     def _log_left(self) -> None:
         stored = self._buffer.stored
-        if stored is not None and stored.count and self._leaves_file():
+        if stored is not None and stored.count and stored.is_in_place and self._leaves_file():
             log_lines.write(
                 logging.WARNING,
                 "output_file_left",

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.outputs.buffer_file import file_errors
+from holdfast.outputs.buffer_file import file_errors, is_in_place
 from holdfast.outputs.sending import Receiver
 from holdfast.outputs.text_file import row
 
 if TYPE_CHECKING:
+    import os
+
     from holdfast.config.models.outputs import FileConfig
     from holdfast.polling import Reading
 
@@ -60,7 +61,7 @@ class Database(Receiver):
 
     def _opened(self) -> sqlite3.Connection:
         """The database; a new one if somebody has removed the file."""
-        if self._db is not None and not self._is_in_place():
+        if self._status is None or not is_in_place(self._file, self._status):
             self.close()
         if self._db is None:
             self._db = sqlite3.connect(self._file, timeout=5.0, check_same_thread=False)
@@ -69,13 +70,6 @@ class Database(Receiver):
             self._db.executescript(_CREATE)
             self._status = self._file.stat()
         return self._db
-
-    def _is_in_place(self) -> bool:
-        try:
-            found = self._file.stat()
-        except OSError:
-            return False
-        return self._status is not None and os.path.samestat(found, self._status)
 
     def _shrink(self, db: sqlite3.Connection) -> None:
         """Removes the oldest rows if there are too many."""
