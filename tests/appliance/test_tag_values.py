@@ -201,6 +201,25 @@ def test_a_receiver_that_can_not_be_reached_delays_nothing_else(
     assert kept == values(tmp_path, "power")
 
 
+def test_line_protocol_has_no_readings_without_a_value(tmp_path: Path) -> None:
+    """They do not count as sent, nor do they hide that nobody listens."""
+    made = settings(0)
+    made["outputs"]["lines"] = {"type": "file", "file": "lines", "format": "influx"}
+    made["outputs"]["down"] = {"type": "influx", "url": "http://127.0.0.1:9", "bucket": "b"}
+    with Fake(lambda request: exception(request, 4)) as fake:
+        made["devices"]["m"]["url"] = f"tcp://127.0.0.1:{fake.port}"
+        with Appliance(load(saved(tmp_path, made))) as appliance:
+
+            def status(name: str) -> Any:
+                return appliance.diagnostics.adapter(f"output/{name}") or {}
+
+            wire.until(lambda: status("down").get("connected") is False, "nobody listens")
+            wire.until(lambda: status("out")["readings"]["sent"] == 4, "the other has them")
+            fake.answer = data
+            wire.until(lambda: status("lines")["readings"]["sent"] == 4, "values are sent")
+            wire.until(lambda: status("down")["waiting"] == 4, "values wait")
+
+
 @pytest.mark.parametrize("after", [{}, {"buffer": {"file": "other.db"}}], ids=["none", "other"])
 def test_values_in_a_file_that_a_reload_takes_away_are_logged(
     tmp_path: Path, device: int, caplog: pytest.LogCaptureFixture, after: dict[str, Any]

@@ -284,6 +284,18 @@ def test_a_receiver_that_can_not_be_reached_is_an_error() -> None:
         output.send(numbered(1))
 
 
+def test_a_receiver_without_values_shows_whether_it_can_be_reached(database: Database) -> None:
+    output = influx(database.url, bucket="b")
+    assert output.idle()
+    assert output.idle()
+    output.send(numbered(1))
+    output.close()
+    assert database.connections == 1
+    nobody = influx(f"http://127.0.0.1:{free_port()}", bucket="b")
+    with pytest.raises(ConnectionRefusedError):
+        nobody.idle()
+
+
 def test_a_receiver_that_is_no_http_server_is_an_error(fake_server: int) -> None:
     output = influx(f"http://127.0.0.1:{fake_server}", bucket="b", gzip=False)
     with pytest.raises(OSError, match="not HTTP"):

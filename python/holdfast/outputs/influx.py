@@ -115,6 +115,12 @@ class Influx(Receiver):
             return status, message
         raise OSError(message)
 
+    def idle(self) -> bool:
+        """Connects: also without a value, it shows whether the receiver can be reached."""
+        if self._connection is None:
+            self._connection = self._opened()
+        return True
+
     def close(self) -> None:
         """Closes the connection."""
         if self._connection is not None:

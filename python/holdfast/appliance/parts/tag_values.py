@@ -91,7 +91,11 @@ class _Output:
                 continue
             if poll.is_standby:  # Another node publishes until this one has the lease again.
                 self.changes.forget([poll.device])
-            offered.append(self.changes.of(poll.readings))
+            readings = self.changes.of(poll.readings)
+            if self.settings.is_line_protocol:
+                # Nothing would be sent of them, but they would count as sent.
+                readings = [each for each in readings if each.value is not None]
+            offered.append(readings)
         self.buffer.offer(offered)
 
 

@@ -58,6 +58,11 @@ class OutputConfig(Model):
     buffer: BufferConfig = Field(default_factory=BufferConfig)
     """What is kept while the receiver can't be reached."""
 
+    @property
+    def is_line_protocol(self) -> bool:
+        """Whether values are published as line protocol, which has none for a missing one."""
+        return False
+
 
 class InfluxConfig(OutputConfig):
     """Line protocol over HTTP: InfluxDB, and others that accept it."""
@@ -88,6 +93,11 @@ class InfluxConfig(OutputConfig):
     """Certificates; requires https://."""
 
     @property
+    def is_line_protocol(self) -> bool:
+        """Always."""
+        return True
+
+    @property
     def target(self) -> HttpTarget:
         """The parts of the URL."""
         return parse_http(self.url)
@@ -109,6 +119,11 @@ class FileConfig(OutputConfig):
     removed."""
     keep: Annotated[int, Field(ge=0, le=1000)] = 10
     """How many rotated files of text to keep."""
+
+    @property
+    def is_line_protocol(self) -> bool:
+        """Only one of its formats is."""
+        return self.format == "influx"
 
 
 class NatsOutputConfig(NatsServersConfig, OutputConfig):
