@@ -81,6 +81,24 @@ def test_a_write_of_the_gateway_has_the_outcome_that_the_device_gave_it(
     assert document("gateway_write", outcome=outcome)["event"]["outcome"] == told
 
 
+@pytest.mark.parametrize(
+    ("event", "fields", "kind", "told"),
+    [
+        ("request_refused", {}, "denied", "failure"),
+        ("request_refused", {"outcome": "not_confirmed"}, "change", "unknown"),
+        ("ingest_refused", {"reason": "not_confirmed"}, "change", "unknown"),
+        ("ingest_refused", {"reason": "internal_error"}, "change", "unknown"),
+        ("ingest_refused", {"outcome": "exception 0B"}, "change", "unknown"),
+        ("ingest_refused", {"outcome": "exception 0A"}, "denied", "failure"),
+    ],
+)
+def test_what_may_have_been_carried_out_was_not_denied(
+    event: str, fields: dict[str, str], kind: str, told: str
+) -> None:
+    made = document(event, **fields)["event"]
+    assert (made["type"], made["outcome"]) == ([kind], told)
+
+
 def test_a_field_has_one_type_in_all_documents() -> None:
     # The address of an item, of a listener, and what a client sent as one.
     for address in (7, "127.0.0.1:502", [1]):

@@ -25,6 +25,7 @@ from holdfast.scanner.subscriptions.key import SubscriptionKey
 from holdfast.tags import Tag, TagList
 from support import wire
 from support.cli import invoke
+from support.fake_device import FakeDevice, exception, registers
 from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges
 from support.leases import BRIEF
@@ -296,6 +297,25 @@ def test_a_command_reaches_the_device_whoever_receives_it(
         assert len({number for number, _ in judge.writes}) == 1
     refused = caller.request("modbus.command.t0", "70000")
     assert "outside" in refused["error"]
+
+
+def test_a_command_that_may_be_carried_out_is_not_denied_whoever_receives_it(
+    node: Callable[..., Running], caller: Caller, caplog: pytest.LogCaptureFixture
+) -> None:
+    share(*map(node, "ab"))
+
+    def answer(pdu: bytes) -> bytes:
+        return exception(pdu, 4) if pdu[0] == 6 else registers(pdu)
+
+    with FakeDevice(answer) as device:
+        tag = {"id": "t", "address": 0, "functionCode": "holding", "datatype": "uint16"}
+        request = {"deviceId": "d0", "url": device.url, "scanRate": 100, "subscriberId": "hmi"}
+        assert caller.request("modbus.subscribe", request | {"tags": [tag]})["success"]
+        for value in range(8):
+            error = caller.request("modbus.command.t", str(value))["error"]
+            assert error.startswith("not confirmed: exception 04")
+    logged = [vars(each)["fields"] for each in caplog.records if each.msg == "request_refused"]
+    assert [each["outcome"] for each in logged] == ["not_confirmed"] * 8
 
 
 def deaf(running: Running) -> None:

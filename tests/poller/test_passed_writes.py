@@ -426,7 +426,9 @@ def test_rest_writes_through_too_and_tells_the_exception(run: Run) -> None:
 
 
 @pytest.mark.parametrize("code", [0, 4])
-def test_rest_shows_the_exception_of_the_device(code: int, run: Run) -> None:
+def test_rest_shows_the_exception_of_the_device(
+    code: int, run: Run, caplog: pytest.LogCaptureFixture
+) -> None:
     def refuse(asked: Asked) -> None:
         asked.answer(exception(asked.pdu, code) if asked.pdu[0] > 4 else None)
 
@@ -438,6 +440,8 @@ def test_rest_shows_the_exception_of_the_device(code: int, run: Run) -> None:
         assert (refused.status, refused.json["reason"]) == (502, "device_refused")
         assert f"meter did not take the write: exception {code:02X}" in refused.json["detail"]
         assert appliance.memories["mirror"].read("holding_registers", 10, 1) == [500]
+    [fields] = [vars(each)["fields"] for each in caplog.records if each.msg == "ingest_refused"]
+    assert (fields["device"], fields["outcome"]) == ("meter", f"exception {code:02X}")
 
 
 class HeldWrites:

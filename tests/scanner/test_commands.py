@@ -319,7 +319,7 @@ def test_a_command_is_answered_while_the_scanner_stops(
     assert answered == [{"success": True} if is_confirmed else said]
 
 
-def test_what_the_device_refuses_is_told(caller: Caller) -> None:
+def test_what_the_device_refuses_is_told(caller: Caller, caplog: pytest.LogCaptureFixture) -> None:
     def answer(pdu: bytes) -> bytes:
         return exception(pdu, pdu[4]) if pdu[0] == 6 else registers(pdu)
 
@@ -341,6 +341,9 @@ def test_what_the_device_refuses_is_told(caller: Caller) -> None:
         ):
             assert caller.request("modbus.command.a", code) == {"success": False, "error": error}
         caller.request("modbus.unsubscribe", leaving("a", subscriberId="x"))
+    logged = [vars(each)["fields"] for each in caplog.records if each.msg == "request_refused"]
+    outcomes = [each.get("outcome") for each in logged]
+    assert outcomes == [None, "not_confirmed", "not_confirmed"]
 
 
 def test_commands_for_one_device_are_carried_out_in_order(

@@ -76,18 +76,22 @@ EVENTS: Mapping[str, Meaning] = {
 }
 
 _NOT_AUTHENTICATED = Meaning(("authentication", "api"), ("start", "denied"), "failure")
+_NOT_CONFIRMED = Meaning(("api",), ("change",), "unknown")
 
 BY_REASON: Mapping[tuple[str, str], Meaning] = {
     ("ingest_refused", "unauthorized"): _NOT_AUTHENTICATED,
     ("gateway_refused", "unauthorized"): _NOT_AUTHENTICATED,
+    ("ingest_refused", "not_confirmed"): _NOT_CONFIRMED,
+    ("ingest_refused", "internal_error"): _NOT_CONFIRMED,
 }
 """Events that are something else for one reason."""
 
-OUTCOMES: Mapping[tuple[str, str], Outcome] = {
-    ("gateway_write", "failed"): "unknown",
-    ("gateway_write", "not sent"): "failure",
-    ("gateway_write", "refused"): "failure",
-    **{("gateway_write", f"exception {code:02X}"): "failure" for code in NOT_EXECUTED},
+OUTCOMES: Mapping[str, Outcome] = {
+    "failed": "unknown",
+    "not_confirmed": "unknown",
+    "not sent": "failure",
+    "refused": "failure",
+    **{f"exception {code:02X}": "failure" for code in NOT_EXECUTED},
 }
 """Outcomes by the field `outcome` of an event. After other Modbus exceptions, it is unknown."""
 
@@ -99,4 +103,7 @@ def meaning(event: str, fields: Mapping[str, object]) -> Meaning | None:
     if found is None or not isinstance(given, str):
         return found
     usual: Outcome = "unknown" if given.startswith("exception") else found.outcome
-    return found._replace(outcome=OUTCOMES.get((event, given), usual))
+    outcome = OUTCOMES.get(given, usual)
+    # What may have been carried out was not denied.
+    kind = found.type if outcome != "unknown" else ("change",)
+    return found._replace(type=kind, outcome=outcome)

@@ -228,7 +228,8 @@ class MemoryAccess:
         detail = f"{begun.device} did not take the write: exception {code:02X} ({name})"
         if code not in NOT_EXECUTED:
             detail += "; it may still be carried out, or have been"
-        refused = Refused("device_refused", detail, **begun.where)
+        where = begun.where | {"device": begun.device, "outcome": f"exception {code:02X}"}
+        refused = Refused("device_refused", detail, **where)
         refused.is_recorded = True
         raise refused
 

@@ -21,7 +21,7 @@ from holdfast.polling.faults import (
     WITHDRAWN,
     fault_text,
 )
-from holdfast.scanner.errors import Moved, Refused
+from holdfast.scanner.errors import Moved, NotConfirmed, Refused
 from holdfast.scanner.late_commands import SEND_AGAIN, Lateness
 from holdfast.scanner.messages.types import Answer
 from holdfast.scanner.subscriptions.write_access import unwritable
@@ -130,7 +130,8 @@ class Commands:
         if fault == STANDBY:  # Its fence is closed, so nothing was sent.
             raise Moved(MOVED)
         if fault:
-            outcome = "not written" if fault in NOT_WRITTEN_FAULTS else "not confirmed"
+            if fault not in NOT_WRITTEN_FAULTS:
+                raise NotConfirmed(f"not confirmed: {fault_text(fault)}")
             again = f"; {SEND_AGAIN}" if fault == EXPIRED else ""
-            raise Refused(f"{outcome}: {fault_text(fault)}{again}")
+            raise Refused(f"not written: {fault_text(fault)}{again}")
         log_lines.write(logging.INFO, "tag_written", device=device.id, tag=tag.id)

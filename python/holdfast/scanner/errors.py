@@ -6,7 +6,14 @@ STOPPING = "the scanner is stopping"
 
 
 class Refused(Exception):
-    """A request was refused; nothing has changed. The message is sent to the caller."""
+    """A request was refused; nothing has changed, but for `NotConfirmed`.
+
+    The message is sent to the caller.
+    """
+
+
+class NotConfirmed(Refused):
+    """Nobody knows whether the request was carried out, or still will be."""
 
 
 class Moved(Refused):

@@ -12,7 +12,7 @@ import msgspec
 from holdfast.events import log_lines
 from holdfast.net.nats import batch
 from holdfast.runtime import tasks
-from holdfast.scanner.errors import STOPPING, Refused
+from holdfast.scanner.errors import STOPPING, NotConfirmed, Refused
 from holdfast.scanner.messages.types import Answer, BrowseAnswer
 
 if TYPE_CHECKING:
@@ -70,8 +70,13 @@ class Responder:
                 await wait()
             return await handle(message)
         except Refused as refused:
+            more = {"outcome": "not_confirmed"} if isinstance(refused, NotConfirmed) else {}
             log_lines.refused(
-                "request_refused", kind=kind, subject=message.subject, reason=str(refused)
+                "request_refused",
+                kind=kind,
+                subject=message.subject,
+                reason=str(refused),
+                **more,
             )
             return Answer(success=False, error=str(refused))
         except asyncio.CancelledError:  # By `end`, while the caller waits.

@@ -23,7 +23,7 @@ from holdfast.replication.leases.bucket import Outdated
 from holdfast.replication.leases.leases import FIRST_RETRY_S, MAX_RETRY_S
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
-from holdfast.scanner.errors import Refused
+from holdfast.scanner.errors import NotConfirmed, Refused
 from holdfast.scanner.fleet.assignment import partition_of
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
 from holdfast.scanner.fleet.partition_leases import PartitionLeases
@@ -297,9 +297,9 @@ class FleetMember(Placement):
                 self._has_new_client.set()  # The bucket may be lost.
                 await self._adopt_now(device)
                 reason = nats_reason(error)
-                is_certain = isinstance(error, NoStreamResponseError)
-                outcome = "not stored in" if is_certain else "not confirmed by"
-                raise Refused(f"{outcome} {self.desired.bucket}: {reason}") from None
+                if isinstance(error, NoStreamResponseError):
+                    raise Refused(f"not stored in {self.desired.bucket}: {reason}") from None
+                raise NotConfirmed(f"not confirmed by {self.desired.bucket}: {reason}") from None
             self._note_renewed(device, renewed)
             return changed
         raise Refused(

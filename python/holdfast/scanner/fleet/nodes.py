@@ -15,7 +15,7 @@ from nats.errors import TimeoutError as NoAnswer
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import nats_reason
 from holdfast.runtime.malformed_json import MALFORMED_JSON
-from holdfast.scanner.errors import STOPPING, Moved, Refused
+from holdfast.scanner.errors import STOPPING, Moved, NotConfirmed, Refused
 from holdfast.scanner.fleet.partition_leases import PARTITION
 from holdfast.scanner.reports.variables import joined
 
@@ -58,6 +58,8 @@ class Executed(msgspec.Struct, kw_only=True, omit_defaults=True):
     """The answer to a command."""
 
     error: str | None = None
+    not_confirmed: bool = False
+    """With an error: it may have been carried out."""
     moved: bool = False
     """The node does not poll the device any more. Nothing was written."""
 
@@ -140,13 +142,13 @@ class OtherNodes:
         except NoRespondersError:  # The only error that is certain: nobody has the command.
             return f"node {owner.node} is gone"
         except (Error, OSError):
-            raise Refused(f"not confirmed: node {owner.node} did not answer") from None
+            raise NotConfirmed(f"not confirmed: node {owner.node} did not answer") from None
         except asyncio.CancelledError:  # By the end of the responder.
-            raise Refused(f"not confirmed: {STOPPING}") from None
+            raise NotConfirmed(f"not confirmed: {STOPPING}") from None
         if done.moved:
             return f"{device.id} moves from node {owner.node} to another one"
         if done.error is not None:
-            raise Refused(done.error)
+            raise (NotConfirmed if done.not_confirmed else Refused)(done.error)
         return None
 
     async def reports(self, what: str, devices: list[ScannedDevice]) -> dict[str, Any]:
@@ -214,7 +216,7 @@ class NodeAnswers:
         except Moved:
             executed = Executed(moved=True)
         except Refused as refused:
-            executed = Executed(error=str(refused))
+            executed = Executed(error=str(refused), not_confirmed=isinstance(refused, NotConfirmed))
         return msgspec.json.encode(executed)
 
     async def browse(self, message: Msg) -> bytes:

@@ -20,7 +20,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast import _core
-from holdfast.scanner.errors import STOPPING, Refused
+from holdfast.scanner.errors import STOPPING, NotConfirmed, Refused
 from holdfast.types import PolledBlock
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ class Polling:
         try:
             return await done
         except asyncio.CancelledError:  # By the end of the responder. It may have been sent.
-            raise Refused(f"not confirmed: {STOPPING}") from None
+            raise NotConfirmed(f"not confirmed: {STOPPING}") from None
         finally:
             del self._writes[number]
 
