@@ -164,10 +164,14 @@ def test_lines_wait_for_a_receiver_that_is_down(
         assert [record(bound.recv(65536))["number"] for _ in range(2)] == [1, 2]
     await_counts(log, "syslog", sent=2, dropped=0, waiting=0)
     wire.until(lambda: "audit_copies_back" in caplog.messages, "it is logged")
+    assert caplog.messages == ["audit_copy_failed", "audit_copies_back"]
 
 
-def test_lines_that_find_no_room_are_dropped_and_counted(
-    tmp_path: Path, audit: Callable[..., Audit], monkeypatch: pytest.MonkeyPatch
+def test_lines_that_find_no_room_are_dropped_counted_and_logged(
+    tmp_path: Path,
+    audit: Callable[..., Audit],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr(copies, "MAX_WAITING_BYTES", 1000)
     file = tmp_path / "audit.log"
@@ -177,16 +181,26 @@ def test_lines_that_find_no_room_are_dropped_and_counted(
     assert told["dropped"] + told["waiting"] == 101
     assert 0 < told["waiting"] < 20
     assert len(lines(file)) == 101
+    wire.until(lambda: "audit_copies_lost" in caplog.messages, "it is logged")
+    failed = counts(log, "syslog")["failed"]
+    wire.until(lambda: counts(log, "syslog")["failed"] > failed + 1, "it is tried again")
+    log.close()
+    lost = [vars(each)["fields"]["count"] for each in caplog.records if "lost" in each.msg]
+    # The second time, those that waited at the end.
+    assert lost == [told["dropped"], told["waiting"]]
+    assert caplog.messages.count("audit_copy_failed") == 1
 
 
 def test_a_line_that_is_too_long_for_a_datagram_is_dropped(
-    udp: socket.socket, audit: Callable[..., Audit]
+    udp: socket.socket, audit: Callable[..., Audit], caplog: pytest.LogCaptureFixture
 ) -> None:
     log = audit(Copies("syslog", Syslog("udp", udp.getsockname())))
     log.write(values=[65535] * 20_000)
     log.write(number=2)
     assert record(udp.recv(65536))["number"] == 2
     await_counts(log, "syslog", sent=1, failed=1, dropped=1, waiting=0)
+    log.close()
+    assert caplog.messages == ["audit_copy_failed"]
 
 
 def test_the_journal_receives_entries(

@@ -9,7 +9,9 @@ from __future__ import annotations
 import errno
 import logging
 import threading
+import time
 from collections import deque
+from math import inf
 from typing import TYPE_CHECKING, Protocol
 
 from holdfast.events import log_lines
@@ -22,6 +24,9 @@ MAX_WAITING_BYTES = 32 * 2**20
 
 RETRY_DELAY_S = 1.0
 """Seconds before a line is sent again."""
+
+LOST_INTERVAL_S = 60.0
+"""Interval of logging that lines were dropped."""
 
 CLOSE_TIMEOUT_S = 2.0
 """Seconds to send what waits when the log is closed."""
@@ -46,7 +51,11 @@ class Copies:
         self._waiting: deque[bytes] = deque()
         self._size = 0
         self._sent = self._failed = self._dropped = 0
-        self._down = self._closing = False
+        self._told, self._told_at = 0, -inf
+        """The dropped lines that were logged, and when."""
+        self._closing = False
+        self._error: str | None = None
+        """Why the receiver has not got the line that waits."""
         self._change = threading.Condition()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"holdfast-{name}", daemon=True)
@@ -84,10 +93,9 @@ class Copies:
         self._thread.join(CLOSE_TIMEOUT_S)
         self._closed.set()
         with self._change:
-            lost, self._dropped = len(self._waiting), self._dropped + len(self._waiting)
+            self._dropped += len(self._waiting)
             self._waiting.clear()
-        if lost:
-            log_lines.write(logging.ERROR, "audit_copies_lost", receiver=self.name, count=lost)
+        self._tell_lost(0.0)
 
     def _run(self) -> None:
         while (line := self._next()) is not None:
@@ -113,13 +121,26 @@ class Copies:
             self._failed += error is not None
             self._sent += error is None
             self._dropped += too_long
+            self._told += too_long
             if (error is None or too_long) and self._waiting:
                 self._size -= len(self._waiting.popleft())
         if error is not None:
-            log_lines.problem("audit_copy_failed", receiver=self.name)
+            # Each line that is lost, and each new reason of an outage.
+            if too_long or str(error) != self._error:
+                log_lines.problem("audit_copy_failed", receiver=self.name)
             if not too_long:
-                self._down = True
+                self._error = str(error)
                 self._closed.wait(RETRY_DELAY_S)
-        elif self._down:
-            self._down = False
+        elif self._error is not None:
+            self._error = None
             log_lines.write(logging.INFO, "audit_copies_back", receiver=self.name)
+        self._tell_lost(LOST_INTERVAL_S)
+
+    def _tell_lost(self, every: float) -> None:
+        """Logs how many lines were dropped, once in some seconds."""
+        with self._change:
+            lost, now = self._dropped - self._told, time.monotonic()
+            if not lost or now < self._told_at + every:
+                return
+            self._told, self._told_at = self._dropped, now
+        log_lines.write(logging.ERROR, "audit_copies_lost", receiver=self.name, count=lost)
