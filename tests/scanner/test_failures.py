@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import os
@@ -13,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
+from holdfast.events import log_lines
+from holdfast.events.throttle import Throttle
 from holdfast.net.nats.connection import MAX_PAUSE
 from holdfast.scanner.jetstream.availability import State
 from holdfast.scanner.subscriptions import device as devices
@@ -277,6 +280,26 @@ def test_a_device_that_is_silent_is_offline_until_it_answers(
     status.until(lambda message: message["state"] == "online", "it is online again")
     data.next()
     caller.request("modbus.unsubscribe", leaving("a", subscriberId="x"))
+
+
+def test_a_device_that_comes_and_goes_does_not_fill_the_log(
+    run_scanner: Run,
+    caller: Caller,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(log_lines, "_REFUSALS", Throttle(burst=2, window=3600))
+    caplog.set_level(logging.INFO, "holdfast")
+    run_scanner()
+    answers = itertools.cycle((registers, lambda pdu: exception(pdu, 4)))
+    with FakeDevice(lambda pdu: next(answers)(pdu)) as plc:
+        request = {"deviceId": "plc1", "subscriberId": "x", "url": plc.url, "scanRate": 50}
+        status = caller.listen("modbus.status.plc1")
+        caller.request("modbus.subscribe", request | {"tags": [tag("a", 0)]})
+        for _ in range(10):
+            status.next()
+        caller.request("modbus.unsubscribe", leaving("a", subscriberId="x"))
+    assert events(caplog).count("device_online") == 2
 
 
 def test_a_bad_address_in_the_middle_of_a_block_costs_its_own_tag_only(

@@ -173,7 +173,9 @@ class Devices:
             self._publishers.publish_state(device)
             level = logging.WARNING if health.error else logging.INFO
             reason = {} if health.error is None else {"error": health.error}
-            log_lines.write(level, f"device_{health.state}", device=device.id, **reason)
+            log_lines.limited(
+                level, f"device_{health.state}", kind=device.id, device=device.id, **reason
+            )
         if device.may_have_moved():
             self._begin_task(self._look_up(device))
         device.latest.take(blocks)
