@@ -35,6 +35,7 @@ def sections(folder: Path, nats: str, device: tuple[str, int]) -> dict[str, Any]
     server = authority.issue("server", "IP:127.0.0.1")
     files = {"cert_file": server.certificate, "key_file": server.key, "ca_file": authority.ca}
     tls = {key: str(file) for key, file in files.items()}
+    https = {key: tls[key] for key in ("cert_file", "key_file")}
     tls["crl_file"] = str(authority.revoke())
     at: dict[str, Any] = {"bind": "127.0.0.1:0", "sources": SOURCES}
     units = {"sources": SOURCES, "units": {1: "kept", 2: {"route": "bus"}}, "access": "read-write"}
@@ -79,7 +80,13 @@ def sections(folder: Path, nats: str, device: tuple[str, int]) -> dict[str, Any]
             "subscriptions": [{"topic": "a", "memories": ["plant"], "areas": ["coils"]}],
         },
         "nats": {"servers": [nats], "devices": SOURCES},
-        "gateway": {**at, "tokens": "none", "allow": SOURCES, "access": "read-only"},
+        "gateway": {
+            **at,
+            "tokens": "none",
+            "allow": SOURCES,
+            "access": "read-only",
+            "tls": https,
+        },
         "outputs": {"table": {"type": "file", "file": "out.jsonl", "format": "jsonl"}},
         "metrics": {**at, "values": True},
         "audit": {"file": "audit.log", "syslog": f"udp://127.0.0.1:{free_port()}"},
@@ -127,12 +134,17 @@ def metrics(appliance: Appliance) -> Labels:
             client.read_holding_registers(100, 1)
     with closing(web.Client(endpoint(appliance, "rest"))) as rest:
         assert rest.ingest({}).status == 400
-    for listener, sent in (("secure", "not TLS"), ("sensors", "not a packet")):
+    for listener, sent in (
+        ("secure", "not TLS"),
+        ("gateway", "not TLS"),
+        ("sensors", "not a packet"),
+    ):
         with socket.create_connection(endpoint(appliance, listener), wire.DEADLINE) as stranger:
             stranger.sendall(sent.encode())
             while stranger.recv(64):
                 pass
-    names = ["tls_failed_total", "packets_refused_total", "ingest_refused_total", "tag_value"]
+    names = ["packets_refused_total", "ingest_refused_total", "tag_value"]
+    names += ["tls_failed_total", "adapter_tls_failed_total"]
     adapters = appliance.diagnostics.adapters
     found: dict[str, dict[str, set[str]]] = {}
 
