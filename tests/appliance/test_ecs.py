@@ -138,6 +138,7 @@ listeners:
     bind: 127.0.0.1:0
     rules:
       - {sources: [127.0.0.0/8], units: {1: plant}, access: read-only}
+      - {sources: [127.0.0.0/8], units: {1: plant}, access: read-only}
 log: {format: ecs}
 """
 
@@ -156,7 +157,14 @@ def test_the_log_of_an_appliance_has_one_document_for_each_event(tmp_path: Path)
         command.process.communicate()
     assert code == 0
     documents = {line["event"]["action"]: line for line in map(json.loads, log.splitlines())}
-    assert list(documents) == ["started", "listening", "refused_function", "stopped"]
+    assert list(documents) == [
+        "config_warning",
+        "started",
+        "listening",
+        "refused_function",
+        "stopped",
+    ]
+    assert "plant.yaml:9: " in documents["config_warning"]["holdfast"]["warning"]
     refused = documents["refused_function"]
     assert refused["destination"] == {"port": address[1]}
     assert refused["source"]["ip"] == "127.0.0.1"

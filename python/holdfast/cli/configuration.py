@@ -109,17 +109,17 @@ def _check_scanner(files: Tls) -> None:
     device_tls.check(files)
 
 
-def load_or_exit(path: Path | str) -> Config:
+def load_or_exit(path: Path | str, *, shows_warnings: bool = True) -> Config:
     """Loads a configuration. If it is not valid, prints every problem and exits.
 
-    Prints warnings on standard error.
+    Prints warnings on standard error, unless the caller logs them.
     """
     try:
         config = load_whole(path)
     except ConfigError as error:
         show_problems(error)
         sys.exit(exit_code(error))
-    for warning in config.warnings:
+    for warning in config.warnings if shows_warnings else ():
         click.echo(f"warning: {warning}", err=True)
     return config
 

@@ -83,7 +83,7 @@ def host(file: Path, name_of: str | None) -> None:
 
 
 def _serve(file: Path, control: ServiceControl) -> None:
-    config = load_or_exit(file)
+    config = load_or_exit(file, shows_warnings=False)
     serve(
         config,
         lambda _: f"{file} is served.",

@@ -78,7 +78,7 @@ def run(file: Path) -> None:
     store confirmed writes, 2 the configuration or a file has errors. The ports of REST, gateway and
     metrics are retried until they are free.
     """
-    config = load_or_exit(file)
+    config = load_or_exit(file, shows_warnings=False)
     serve(config, lambda appliance: _greeting(appliance, file), named=str(file), file=file)
 
 
@@ -100,6 +100,8 @@ def serve(
     in use is an error. With `control`, requests of Windows take the place of signals.
     """
     log_lines.configure(config.log.level, config.log.format)
+    for warning in config.warnings:
+        log_lines.write(logging.WARNING, "config_warning", warning=str(warning))
     yield_interpreter()
     allow_open_files(config, file)
     signals = control or Signals(
