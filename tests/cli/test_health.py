@@ -190,7 +190,10 @@ def http(status: str, body: bytes) -> bytes:
         (b"\x00\x01not http\r\n\r\n", "\\x00"),
         (http("200 OK", b'{"status":"ok"}'), "status 200, not the answer of an appliance"),
         (http("404 Not Found", b"[]"), "status 404, not the answer of an appliance"),
-        (http("200 OK", b'{"checks":{"a":1}}'), "status 200, not the answer of an appliance"),
+        (
+            http("200 OK", b'{"ok":true,"checks":{"a":1}}'),
+            "status 200, not the answer of an appliance",
+        ),
         (http("200 OK", b"[" * 100_000), "status 200, not the answer of an appliance"),
     ],
 )
@@ -232,10 +235,24 @@ def test_a_slow_answer_does_not_take_longer_than_the_timeout() -> None:
     assert (result.exit_code, "no answer in 0.5 s" in result.stderr) == (1, True)
 
 
+@pytest.mark.parametrize(
+    ("status", "ok", "code"), [("200 OK", True, 0), ("200 OK", False, 1), ("503 No", True, 1)]
+)
+def test_only_a_good_answer_with_a_good_status_is_ready(
+    server: Callable[[bytes], str], status: str, ok: bool, code: int
+) -> None:
+    """As of a proxy that changes the status."""
+    body = json.dumps({"ok": ok, "checks": {"a": {"ok": ok, "detail": ""}}}).encode()
+    result = invoke("health", "--url", server(http(status, body)))
+    assert (result.exit_code, result.stdout.startswith("ready\n")) == (code, code == 0)
+
+
 def test_texts_of_a_stranger_are_shown_without_control_characters(
     server: Callable[[bytes], str],
 ) -> None:
-    body = json.dumps({"checks": {"a\x1b": {"ok": False, "detail": "\x1b[2J"}}}).encode()
+    body = json.dumps(
+        {"ok": False, "checks": {"a\x1b": {"ok": False, "detail": "\x1b[2J"}}}
+    ).encode()
     result = invoke("health", "--url", server(http("503 No", body)))
     assert (result.exit_code, "\x1b" in result.stdout) == (1, False)
     assert r"\x1b[2J" in result.stdout

@@ -164,11 +164,11 @@ def _response(
         return _NoAnswer(plain(str(error)) or type(error).__name__)
     try:
         answer = json.loads(body)
-        checks = answer["checks"]
+        is_well, checks = answer["ok"] is True, answer["checks"]
         [each["ok"] for each in checks.values()]
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return _NoAnswer(f"status {status}, not the answer of an appliance to a probe")
-    return {"ok": status == http.client.OK, "checks": checks}
+    return {"ok": status == http.client.OK and is_well, "checks": checks}
 
 
 def _shown(found: dict[str, Any], state: str) -> str:
