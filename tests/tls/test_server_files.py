@@ -18,7 +18,7 @@ from holdfast.cli.configuration import load_whole
 from holdfast.config import ConfigError
 from holdfast.server.options import STREAM_DEFAULTS
 from support import wire
-from support.certificate_cases import CA, NAME, SIGNS, Mint
+from support.certificate_cases import CA, NAME, SALT_OF_KEY, SIGNS, WITH_PSS, Mint
 from support.certificates import FUTURE, PAST, Certificates, Issued, named
 from support.tls_peer import configuration, context, reasons, verdict
 
@@ -207,6 +207,36 @@ def test_a_listed_certificate_that_is_revoked_is_doubtful(plant: Plant, mint: Mi
         "certificate 2 of ca_file (CN=client) is revoked: this client is refused",
         "found no list of certificate 1 of ca_file (CN=between): its clients are refused",
     ]
+
+
+@pytest.mark.parametrize(
+    ("key", "signature"),
+    [
+        ("RSA", {}),
+        ("RSA", {"digest": "sha1"}),
+        ("RSA", {"options": (*WITH_PSS, *SALT_OF_KEY)}),
+        ("RSA 1024", {}),
+    ],
+    ids=["SHA-256", "SHA-1", "PSS with the longest salt", "a short key"],
+)
+def test_a_listed_client_below_a_revoked_authority_is_refused_whatever_its_signature(
+    key: str,
+    signature: dict[str, Any],
+    plant: Plant,
+    mint: Mint,
+    run: Run,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    root = Issued(plant.authority.ca, plant.authority.key)
+    between = mint.make(by=root, name="between", key=key, extensions=(CA, SIGNS))
+    client = mint.make(by=between, name="leaf", extensions=[named("a")], **signature)
+    listed = plant.joined("listed.pem", root.certificate, between.certificate, client.certificate)
+    files = {"ca_file": listed, "crl_file": plant.authority.revoke(between)}
+    told = "certificate 3 of ca_file (CN=leaf) is revoked: this client is refused"
+    assert told in plant.warnings(**files)
+    appliance = run(plant.config(**files).read_text())
+    assert "REVOKED" in verdict(appliance, context(plant.authority.ca, client, weak=True))
+    assert reasons(appliance, caplog) == ["revoked"]
 
 
 def test_a_list_can_revoke_a_client_that_is_listed_without_its_authority(

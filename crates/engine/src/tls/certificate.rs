@@ -1,6 +1,6 @@
 //! Reads the properties of an X.509 certificate that trust and roles depend on.
 
-use rustls::pki_types::{CertificateDer, UnixTime};
+use rustls::pki_types::{CertificateDer, SignatureVerificationAlgorithm, UnixTime};
 use rustls::{CertificateError, ExtendedKeyPurpose};
 use webpki::KeyPurposeId;
 use x509_cert::certificate::{CertificateInner, Profile};
@@ -97,15 +97,22 @@ impl Profile for AnySerial {
 
 /// A parsed certificate.
 #[derive(Debug)]
-pub(super) struct Parsed(CertificateInner<AnySerial>);
+pub(super) struct Parsed {
+    certificate: CertificateInner<AnySerial>,
+    /// What is signed, as received: encoded again, it may be other bytes.
+    signed: Vec<u8>,
+}
 
 impl Parsed {
     /// # Errors
     /// [`CertificateError::BadEncoding`] when it is not an X.509 certificate.
     pub(super) fn new(certificate: &CertificateDer<'_>) -> Result<Parsed, CertificateError> {
-        let parsed =
-            CertificateInner::from_der(certificate).map_err(|_| CertificateError::BadEncoding)?;
-        Ok(Parsed(parsed))
+        let read = || {
+            let whole = AnyRef::from_der(certificate)?;
+            let signed = SliceReader::new(whole.value())?.tlv_bytes()?.to_vec();
+            Ok(Parsed { certificate: CertificateInner::from_der(certificate)?, signed })
+        };
+        read().map_err(|_: der::Error| CertificateError::BadEncoding)
     }
 
     /// The role in the certificate; empty, the null role, when there is none.
@@ -115,7 +122,8 @@ impl Parsed {
     /// the extension is critical. Software that does not know a critical extension must refuse the
     /// certificate, and the verifier does not know roles.
     pub(super) fn role(&self) -> Result<String, TlsFailure> {
-        let extensions = self.0.tbs_certificate().extensions().map_or(&[][..], Vec::as_slice);
+        let extensions =
+            self.certificate.tbs_certificate().extensions().map_or(&[][..], Vec::as_slice);
         let mut named = extensions.iter().filter(|extension| extension.extn_id == ROLE);
         let role = match (named.next(), named.next()) {
             (None, _) => return Ok(String::new()),
@@ -133,7 +141,7 @@ impl Parsed {
 
     /// Whether it is an authority: it has `CA:TRUE`, and its `keyUsage`, if any, has `keyCertSign`.
     pub(super) fn is_authority(&self) -> bool {
-        let usage = self.0.tbs_certificate().get_extension::<KeyUsage>();
+        let usage = self.certificate.tbs_certificate().get_extension::<KeyUsage>();
         self.has_ca_flag()
             && usage.is_ok_and(|usage| usage.is_none_or(|(_, usage)| usage.key_cert_sign()))
     }
@@ -149,18 +157,18 @@ impl Parsed {
     }
 
     fn constraints(&self) -> Option<BasicConstraints> {
-        let found = self.0.tbs_certificate().get_extension();
+        let found = self.certificate.tbs_certificate().get_extension();
         found.ok().flatten().map(|(_, constraints)| constraints)
     }
 
     /// Whether its issuer is its own subject.
     pub(super) fn is_self_signed(&self) -> bool {
-        self.0.tbs_certificate().issuer() == self.0.tbs_certificate().subject()
+        self.certificate.tbs_certificate().issuer() == self.certificate.tbs_certificate().subject()
     }
 
     /// Its first and last second.
     pub(super) fn validity(&self) -> (UnixTime, UnixTime) {
-        let validity = self.0.tbs_certificate().validity();
+        let validity = self.certificate.tbs_certificate().validity();
         let [first, last] = [&validity.not_before, &validity.not_after]
             .map(|time| UnixTime::since_unix_epoch(time.to_unix_duration()));
         (first, last)
@@ -182,7 +190,7 @@ impl Parsed {
     /// # Errors
     /// Its `extendedKeyUsage` lacks the purpose.
     pub(super) fn is_for(&self, purpose: Purpose) -> Result<(), CertificateError> {
-        let named = self.0.tbs_certificate().get_extension::<ExtendedKeyUsage>();
+        let named = self.certificate.tbs_certificate().get_extension::<ExtendedKeyUsage>();
         match named.map_err(|_| CertificateError::BadEncoding)? {
             Some((_, ExtendedKeyUsage(named))) => {
                 let is_for = !named.is_empty() && purpose.is_among(named.iter().map(purpose_id));
@@ -236,18 +244,18 @@ impl Parsed {
     }
 
     pub(super) fn key(&self) -> &SubjectPublicKeyInfoOwned {
-        self.0.tbs_certificate().subject_public_key_info()
+        self.certificate.tbs_certificate().subject_public_key_info()
     }
 
     /// What it calls its key.
     pub(super) fn own_key(&self) -> Option<OctetString> {
-        let found = self.0.tbs_certificate().get_extension::<SubjectKeyIdentifier>();
+        let found = self.certificate.tbs_certificate().get_extension::<SubjectKeyIdentifier>();
         found.ok().flatten().map(|(_, id)| id.0)
     }
 
     /// What it calls the key of its authority.
     pub(super) fn authority_key(&self) -> Option<OctetString> {
-        let found = self.0.tbs_certificate().get_extension::<AuthorityKeyIdentifier>();
+        let found = self.certificate.tbs_certificate().get_extension::<AuthorityKeyIdentifier>();
         found.ok().flatten()?.1.key_identifier
     }
 
@@ -257,80 +265,100 @@ impl Parsed {
 
     /// Whether its issuer is the subject of another certificate.
     pub(super) fn is_issued_by(&self, other: &Parsed) -> bool {
-        other.has_subject(self.0.tbs_certificate().issuer())
+        other.has_subject(self.certificate.tbs_certificate().issuer())
     }
 
     /// Whether another certificate is its issuer, and has the key that signed it.
     pub(super) fn is_signed_by(&self, other: &Parsed) -> bool {
-        let signed = self.0.tbs_certificate().to_der();
-        self.is_issued_by(other)
-            && signed.is_ok_and(|signed| {
-                other.has_signed(&signed, self.0.signature_algorithm(), self.0.signature())
+        self.is_issued_by(other) && self.has_signature_of(other) == Some(true)
+    }
+
+    /// Whether an authority may have issued it. Its signature tells, unless it can't be verified with the key of
+    /// that authority. Then every one of the name may, unless the certificate names another key, or another
+    /// `listed` one has signed it.
+    pub(super) fn may_be_of(&self, authority: &Parsed, listed: &[&Parsed]) -> bool {
+        self.is_issued_by(authority)
+            && self.has_signature_of(authority).unwrap_or_else(|| {
+                let keys = self.authority_key().zip(authority.own_key());
+                keys.is_none_or(|(named, key)| named == key)
+                    && !listed.iter().any(|each| self.is_signed_by(each))
             })
     }
 
-    /// Whether a signature is one of its key.
+    fn has_signature_of(&self, other: &Parsed) -> Option<bool> {
+        let (by, signature) =
+            (self.certificate.signature_algorithm(), self.certificate.signature());
+        other.has_signed(&self.signed, by, signature)
+    }
+
+    /// Whether a signature is one of its key; `None` if that can't be verified: the algorithm or the key is not
+    /// supported.
     pub(super) fn has_signed(
         &self,
         content: &[u8],
         by: &AlgorithmIdentifierOwned,
         signature: &BitString,
-    ) -> bool {
+    ) -> Option<bool> {
+        self.has_supported_key().ok()?;
         let (with, of) = (algorithm_content(by), self.key_algorithm());
         let key = self.key().subject_public_key.raw_bytes();
-        ALGORITHMS.all.iter().any(|algorithm| {
+        let fits = |algorithm: &&&dyn SignatureVerificationAlgorithm| {
             with.as_deref() == Some(algorithm.signature_alg_id().as_ref())
                 && of.as_deref() == Some(algorithm.public_key_alg_id().as_ref())
-                && algorithm.verify_signature(key, content, signature.raw_bytes()).is_ok()
-        })
+        };
+        let mut fitting = ALGORITHMS.all.iter().filter(fits).peekable();
+        fitting.peek()?;
+        Some(fitting.any(|algorithm| {
+            algorithm.verify_signature(key, content, signature.raw_bytes()).is_ok()
+        }))
     }
 
     pub(super) fn has_subject(&self, name: &Name) -> bool {
-        self.0.tbs_certificate().subject() == name
+        self.certificate.tbs_certificate().subject() == name
     }
 
     pub(super) fn has_issuer(&self, name: &Name) -> bool {
-        self.0.tbs_certificate().issuer() == name
+        self.certificate.tbs_certificate().issuer() == name
     }
 
     /// The subject for a log, as RFC 4514 writes it. Control characters are replaced.
     pub(super) fn subject_text(&self) -> String {
-        name_text(self.0.tbs_certificate().subject())
+        name_text(self.certificate.tbs_certificate().subject())
     }
 
     /// The issuer, as [`Parsed::subject_text`].
     pub(super) fn issuer_text(&self) -> String {
-        name_text(self.0.tbs_certificate().issuer())
+        name_text(self.certificate.tbs_certificate().issuer())
     }
 
     /// The serial number for a log, in hexadecimal digits.
     pub(super) fn serial_text(&self) -> String {
-        let number = self.0.tbs_certificate().serial_number().as_bytes().iter();
+        let number = self.certificate.tbs_certificate().serial_number().as_bytes().iter();
         number.take(MAX_SERIAL_LEN).map(|byte| format!("{byte:02x}")).collect()
     }
 
     /// Whether its key may sign a handshake: `keyUsage`, if any, has `digitalSignature`.
     pub(super) fn may_sign_handshakes(&self) -> bool {
-        let usage = self.0.tbs_certificate().get_extension::<KeyUsage>();
+        let usage = self.certificate.tbs_certificate().get_extension::<KeyUsage>();
         usage.is_ok_and(|usage| usage.is_none_or(|(_, usage)| usage.digital_signature()))
     }
 
     /// Whether its key may sign revocation lists: `keyUsage`, if any, has `cRLSign`.
     pub(super) fn may_sign_lists(&self) -> bool {
-        let usage = self.0.tbs_certificate().get_extension::<KeyUsage>();
+        let usage = self.certificate.tbs_certificate().get_extension::<KeyUsage>();
         usage.is_ok_and(|usage| usage.is_none_or(|(_, usage)| usage.crl_sign()))
     }
 
     /// Where its authority publishes revocation lists.
     pub(super) fn distribution_points(&self) -> der::Result<Option<CrlDistributionPoints>> {
-        let found = self.0.tbs_certificate().get_extension();
+        let found = self.certificate.tbs_certificate().get_extension();
         found.map(|found| found.map(|(_, points)| points))
     }
 
     /// The issuer by which a client finds that a server that lists this certificate accepts its own: an
     /// authority itself, and the issuer of any other certificate. A distinguished name as DER.
     pub(super) fn accepted_issuer(&self) -> Option<Vec<u8>> {
-        let certificate = self.0.tbs_certificate();
+        let certificate = self.certificate.tbs_certificate();
         let name = if self.is_authority() { certificate.subject() } else { certificate.issuer() };
         name.to_der().ok()
     }
@@ -456,7 +484,7 @@ mod tests {
 
     #[test]
     fn bytes_that_are_not_a_certificate_are_an_error() {
-        let good = parsed(|_| {}).0.to_der().unwrap();
+        let good = parsed(|_| {}).certificate.to_der().unwrap();
         for len in 0..good.len() {
             assert!(Parsed::new(&CertificateDer::from(&good[..len])).is_err(), "{len} bytes");
         }

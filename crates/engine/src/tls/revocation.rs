@@ -123,10 +123,11 @@ impl List {
         found.iter().find(|each| each.extn_id == id)
     }
 
-    /// Whether an authority has signed it.
+    /// Whether an authority is its issuer, and has the key that signed it.
     pub(super) fn is_signed_by(&self, authority: &Parsed) -> bool {
         let CertificateList { signature_algorithm, signature, .. } = &self.parsed;
-        authority.has_signed(&self.signed, signature_algorithm, signature)
+        authority.has_subject(self.issuer())
+            && authority.has_signed(&self.signed, signature_algorithm, signature) == Some(true)
     }
 
     /// Whether a list that an issuer has not signed is provably of another authority of the same name:
@@ -141,9 +142,7 @@ impl List {
             (Some(named), Some(key)) => named != *key,
             _ => false,
         };
-        let has_signed =
-            |each: &&Parsed| each.has_subject(self.issuer()) && self.is_signed_by(each);
-        names_another || others.iter().any(has_signed)
+        names_another || others.iter().any(|each| self.is_signed_by(each))
     }
 
     /// Whether the list is for a certificate: it has the same issuer, and the certificate is within its
@@ -226,9 +225,9 @@ impl Lists {
     }
 
     /// Judges a listed certificate, which needs no list: the operator vouches for it. The newest list
-    /// that its authority has signed counts, if that is listed. Before it, and if it is not, nobody
-    /// knows whose lists those of its name are: the newest of each key counts, except those that are
-    /// provably of another authority.
+    /// that its authority has signed counts, if a listed one has provably signed the certificate. Before
+    /// it, and if none has, nobody knows whose lists those of its name are: the newest of each key counts,
+    /// except those that are provably of another authority.
     ///
     /// # Errors
     /// It is revoked.
@@ -245,21 +244,22 @@ impl Lists {
             return Ok(());
         }
         let issuer = listed.iter().find(|each| parsed.is_signed_by(each));
-        // Without an issuer, a list that a listed authority has signed is not provably of another: the
-        // signature of the certificate may be an unsupported one of the same key.
-        let (key, others) = match issuer {
-            Some(issuer) => (issuer.own_key(), listed),
-            None => (parsed.authority_key(), &[][..]),
-        };
+        let key = issuer.map_or_else(|| parsed.authority_key(), |issuer| issuer.own_key());
+        let others = listed.iter().copied().filter(|each| !parsed.may_be_of(each, listed));
+        let others: Vec<_> = others.collect();
         let mut judged = Vec::new();
         for list in lists() {
             if issuer.is_some_and(|issuer| list.is_signed_by(issuer)) {
                 return list.check(certificate);
             }
-            let named = list.authority_key();
-            if !judged.contains(&named) && !list.is_of_another(key.as_ref(), others) {
+            // Lists that name no key may be of several authorities.
+            let of_key = match list.authority_key() {
+                None => (None, listed.iter().position(|each| list.is_signed_by(each))),
+                named => (named, None),
+            };
+            if !judged.contains(&of_key) && !list.is_of_another(key.as_ref(), &others) {
                 list.check(certificate)?;
-                judged.push(named);
+                judged.push(of_key);
             }
         }
         Ok(())
@@ -368,6 +368,10 @@ mod tests {
     use std::time::Duration;
 
     use rcgen::{CertificateParams, CrlDistributionPoint, CrlScope, KeyUsagePurpose, SigningKey};
+    use rustls::pki_types::CertificateDer;
+    use x509_cert::certificate::CertificateInner;
+    use x509_cert::der::asn1::{AnyRef, BitString};
+    use x509_cert::spki::AlgorithmIdentifierOwned;
 
     use super::*;
     use crate::tls::TlsFailure;
@@ -401,16 +405,45 @@ mod tests {
         list.tbs_cert_list.crl_extensions = None;
         let version_2 = list.tbs_cert_list.to_der().unwrap();
         // Without the version, which is the first field.
-        let content = der::asn1::AnyRef::from_der(&version_2).unwrap().value()[3..].to_vec();
-        let signed = der::asn1::AnyRef::new(der::Tag::Sequence, &content).unwrap();
-        let signature = by.key.sign(&signed.to_der().unwrap()).unwrap();
-        let parts = [
-            signed.to_der().unwrap(),
-            list.signature_algorithm.to_der().unwrap(),
-            der::asn1::BitString::from_bytes(&signature).unwrap().to_der().unwrap(),
-        ];
-        let whole = parts.concat();
-        der::asn1::AnyRef::new(der::Tag::Sequence, &whole).unwrap().to_der().unwrap()
+        let content = AnyRef::from_der(&version_2).unwrap().value()[3..].to_vec();
+        signed(by, &content, &list.signature_algorithm)
+    }
+
+    /// Signs a list or a certificate with this content.
+    fn signed(by: &Owner, content: &[u8], algorithm: &AlgorithmIdentifierOwned) -> Vec<u8> {
+        let sequence =
+            |content: &[u8]| AnyRef::new(der::Tag::Sequence, content).unwrap().to_der().unwrap();
+        let signed = sequence(content);
+        let signature = BitString::from_bytes(&by.key.sign(&signed).unwrap()).unwrap();
+        let parts = [signed, algorithm.to_der().unwrap(), signature.to_der().unwrap()];
+        sequence(&parts.concat())
+    }
+
+    /// A certificate as if signed with SHA-224, which is not supported.
+    fn with_unsupported_signature(owner: &Owner) -> Vec<u8> {
+        let mut der = owner.certificate.der().to_vec();
+        let sha256 = b"\x2a\x86\x48\xce\x3d\x04\x03\x02";
+        for at in 0..der.len() - sha256.len() {
+            if der[at..].starts_with(sha256) {
+                der[at + sha256.len() - 1] = 1;
+            }
+        }
+        der
+    }
+
+    /// A certificate whose first extension has its default written out: not as DER requires.
+    fn with_written_default(owner: &Owner, by: &Owner) -> Vec<u8> {
+        let der = owner.certificate.der();
+        let whole = CertificateInner::<AnySerial>::from_der(der).unwrap();
+        let content = whole.tbs_certificate().to_der().unwrap();
+        let mut content = AnyRef::from_der(&content).unwrap().value().to_vec();
+        let alternative_name = b"\x06\x03\x55\x1d\x11";
+        let at = content.windows(5).position(|found| found == alternative_name).unwrap();
+        for len in [at - 5, at - 3, at - 1] {
+            content[len] += 3;
+        }
+        content.splice(at + 5..at + 5, *b"\x01\x01\x00");
+        signed(by, &content, whole.signature_algorithm())
     }
 
     /// The reason why a client is not trusted; empty if it is.
@@ -419,12 +452,18 @@ mod tests {
     }
 
     fn judged_by(listed: &[&Owner], lists: &[Vec<u8>], chain: &[&Owner]) -> &'static str {
+        let [listed, chain] = [listed, chain]
+            .map(|owners| owners.iter().map(|owner| &owner.certificate.der()[..]).collect());
+        judged_as_der(listed, lists, chain)
+    }
+
+    fn judged_as_der(listed: Vec<&[u8]>, lists: &[Vec<u8>], chain: Vec<&[u8]>) -> &'static str {
         let lists = lists.iter().map(|der| List::new(der, 1).unwrap()).collect();
-        let listed = listed.iter().map(|owner| Listed::new(owner.certificate.der().clone()));
+        let listed = listed.iter().map(|der| Listed::new(CertificateDer::from(der.to_vec())));
         let lists = Lists { lists, expired: ExpiredLists::Refuse };
         let trust = Trust::new(listed.collect::<Result<_, _>>().unwrap(), lists);
-        let ders: Vec<_> = chain.iter().map(|owner| owner.certificate.der().clone()).collect();
-        match trust.judge(&ders[0], &ders[1..], Purpose::Client, NOW) {
+        let chain: Vec<_> = chain.into_iter().map(CertificateDer::from).collect();
+        match trust.judge(&chain[0], &chain[1..], Purpose::Client, NOW) {
             Ok(()) => "",
             Err(error) => TlsFailure::from(error).reason(),
         }
@@ -642,6 +681,78 @@ mod tests {
         assert_eq!(judged_by(&[&former, &renewed], &lists, &[&leaf]), "");
         assert_eq!(judged_by(&[&renewed, &former], &lists, &[&leaf]), "");
         assert_eq!(judged_by(&[&former], &lists, &[&leaf]), "revoked");
+    }
+
+    #[test]
+    fn whoever_may_be_below_a_revoked_authority_is_refused() {
+        let root = Owner::authority("root", None);
+        // With the same name, and keys of their own.
+        let [revoked, valid] = [3, 5].map(|number| {
+            Owner::new("between", Some(&root), |params| {
+                numbered(number)(params);
+                params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+            })
+        });
+        let lists = [version_1(&root, &[&revoked]), version_1(&valid, &[])];
+        let named = |params: &mut CertificateParams| {
+            params.use_authority_key_identifier_extension = true;
+        };
+        let of_each = |der: &dyn Fn(&Owner) -> Vec<u8>| {
+            [&revoked, &valid].map(der).map(|leaf| {
+                [&[&revoked][..], &[&revoked, &valid], &[&valid, &revoked]].map(|authorities| {
+                    let authorities = [&[&root], authorities].concat();
+                    let authorities = authorities.iter().map(|each| &each.certificate.der()[..]);
+                    judged_as_der(authorities.chain([&leaf[..]]).collect(), &lists, vec![&leaf])
+                })
+            })
+        };
+        let told_apart = [["revoked"; 3], [""; 3]];
+        let leaf = |by: &Owner| Owner::new("leaf", Some(by), |_| {});
+        assert_eq!(of_each(&|by| leaf(by).certificate.der().to_vec()), told_apart);
+        assert_eq!(of_each(&|by| with_written_default(&leaf(by), by)), told_apart);
+        let names_key = |by: &Owner| Owner::new("leaf", Some(by), named);
+        assert_eq!(of_each(&|by| with_unsupported_signature(&names_key(by))), told_apart);
+        assert_eq!(of_each(&|by| with_unsupported_signature(&leaf(by))), [["revoked"; 3]; 2]);
+        // One with a key of another kind is not the issuer if another listed one has signed.
+        let params = revoked.params.clone();
+        let key = rcgen::KeyPair::generate_for(&rcgen::PKCS_ED25519).unwrap();
+        let certificate = params.signed_by(&key, &root.issuer()).unwrap();
+        let other = Owner { certificate, params, key };
+        let served = leaf(&valid);
+        assert_eq!(judged_by(&[&root, &other, &valid, &served], &lists, &[&served]), "");
+        // An authority is refused with all its clients.
+        let below = Owner::authority("below", Some(&revoked));
+        let leaf = Owner::new("leaf", Some(&below), numbered(4));
+        let listed = [&root, &revoked].map(|each| &each.certificate.der()[..]);
+        let lists = [&lists[..], &[version_1(&below, &[])]].concat();
+        for below in [with_unsupported_signature(&below), with_written_default(&below, &revoked)] {
+            let listed = [&listed[..], &[&below]].concat();
+            assert_eq!(judged_as_der(listed, &lists, vec![leaf.certificate.der()]), "revoked");
+        }
+    }
+
+    #[test]
+    fn the_newest_list_of_every_authority_counts_that_may_have_issued_a_listed_certificate() {
+        let [root, twin] = [0; 2].map(|_| Owner::authority("root", None));
+        let reason = |names_key, lists: [&Vec<u8>; 2]| {
+            let leaf = Owner::new("leaf", Some(&root), |params| {
+                numbered(4)(params);
+                params.use_authority_key_identifier_extension = names_key;
+            });
+            let leaf = with_unsupported_signature(&leaf);
+            let listed = vec![&leaf[..], root.certificate.der(), twin.certificate.der()];
+            judged_as_der(listed, &lists.map(Clone::clone), vec![&leaf])
+        };
+        let revoked = Owner::new("leaf", Some(&root), numbered(4));
+        let (by_root, by_twin) = (version_1(&root, &[&revoked]), version_1(&twin, &[&revoked]));
+        let (none_by_root, none_by_twin) = (version_1(&root, &[]), version_1(&twin, &[]));
+        for [names_key, by_twin_counts] in [[true, false], [false, true]] {
+            assert_eq!(reason(names_key, [&none_by_twin, &by_root]), "revoked");
+            assert_eq!(reason(names_key, [&by_root, &none_by_twin]), "revoked");
+            let of_twin = if by_twin_counts { "revoked" } else { "" };
+            assert_eq!(reason(names_key, [&by_twin, &none_by_root]), of_twin);
+            assert_eq!(reason(names_key, [&none_by_root, &by_twin]), of_twin);
+        }
     }
 
     #[test]

@@ -120,13 +120,19 @@ impl Trust {
         })
     }
 
-    /// Whether listed authorities have signed a listed certificate, and all of these are revoked: of two
-    /// with the same name and key, one may be valid.
+    /// Whether a listed authority that may have issued a listed certificate is revoked. Of several with the
+    /// same name and key, one may be valid.
     fn is_below_revoked_ones(&self, listed: &Listed) -> bool {
-        let has_signed =
-            |each: &&Listed| each.is_authority() && listed.parsed.is_signed_by(&each.parsed);
-        let mut issuers = self.listed.iter().filter(has_signed).peekable();
-        issuers.peek().is_some() && issuers.all(|issuer| self.is_revoked(issuer))
+        let authorities = self.authorities();
+        let may_have_issued = |each: &&Listed| {
+            each.is_authority() && listed.parsed.may_be_of(&each.parsed, &authorities)
+        };
+        let issuers: Vec<_> = self.listed.iter().filter(may_have_issued).collect();
+        issuers.iter().any(|issuer| {
+            let mut of_its_key =
+                issuers.iter().filter(|each| each.parsed.key() == issuer.parsed.key());
+            of_its_key.all(|each| self.is_revoked(each))
+        })
     }
 
     /// Whether a listed certificate is revoked: by a list, or since those above it are.
