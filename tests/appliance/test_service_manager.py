@@ -230,7 +230,8 @@ def test_a_stalled_thread_starves_the_watchdog(monkeypatch: pytest.MonkeyPatch) 
         monkeypatch.setattr(command, skipped, lambda *_: 0)
     monkeypatch.setattr(command, "spare_what_stays", lambda: steps.append("freeze"))
     monkeypatch.setattr("holdfast.events.log_lines.configure", lambda *_: None)
-    settings: Any = SimpleNamespace(log=SimpleNamespace(level="info", format="text"))
+    log = SimpleNamespace(level="info", format="text")
+    settings: Any = SimpleNamespace(log=log, warnings=())
     command.serve(settings, lambda _: "served", named="test")
     assert steps == [
         "start",
