@@ -157,18 +157,6 @@ def test_a_file_that_is_moved_is_written_again(tmp_path: Path) -> None:
     assert (tmp_path / "a.csv").read_text("utf-8") == (tmp_path / "b.csv").read_text("utf-8")
 
 
-def test_only_one_output_at_a_time_writes_a_file(tmp_path: Path) -> None:
-    first, second = (TextFile(settings(tmp_path / "a.csv", "csv")) for _ in range(2))
-    first.send([reading(1)])
-    with pytest.raises(OSError, match=r"a\.csv: another process writes it"):
-        second.send([reading(2)])
-    first.close()
-    second.send([reading(2)])
-    second.close()
-    lines = (tmp_path / "a.csv").read_text("utf-8").splitlines()
-    assert [line.split(",")[3] for line in lines] == ["value", "1", "2"]
-
-
 @pytest.mark.parametrize("lines", [0, 1, 2])
 @pytest.mark.parametrize("kind", ["csv", "jsonl", "influx"])
 def test_a_line_that_a_crash_has_cut_off_is_removed(

@@ -12,7 +12,6 @@ import msgspec
 
 from holdfast.config.models.outputs import MEASUREMENT
 from holdfast.events import log_lines
-from holdfast.events.file_lock import lock
 from holdfast.events.rotation import Rotation
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.sending import Receiver
@@ -77,23 +76,15 @@ class TextFile(Receiver):
         if self._open is not None and not _is_same(self._open, self._file):
             self.close()
         if self._open is None:
-            self._open = self._locked()
             self._rotation.take_up()
+            self._open = self._file.open("ab", buffering=0)
             _end_line(self._open, self._file, self._form)
         size = self._open.seek(0, os.SEEK_END)
         if size and size + more > self._max_bytes and self._rotation.may_rotate:
             self.close()
             self._rotation.rotate()
-            self._open = self._locked()
+            self._open = self._file.open("ab", buffering=0)
         return self._open
-
-    def _locked(self) -> io.FileIO:
-        # Where a line is cut off or the file is full, two would remove lines of each other.
-        file = self._file.open("ab", buffering=0)
-        if not lock(file.fileno()):
-            file.close()
-            raise OSError(f"{self._file}: another process writes it")
-        return file
 
     def _not_rotated(self) -> None:
         log_lines.problem("output_not_rotated", file=str(self._file))
