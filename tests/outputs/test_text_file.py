@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.config.models.outputs import FileConfig
+from holdfast.outputs import text_file
 from holdfast.outputs.sqlite_file import Database
 from holdfast.outputs.text_file import HEAD, TextFile
 from support.line_protocol import parsed
@@ -179,6 +180,28 @@ def test_a_line_that_a_crash_has_cut_off_is_removed(
     [record] = caplog.records
     fields = {"file": str(path), "bytes": len(whole[lines]) - 5}
     assert (record.message, vars(record)["fields"]) == ("output_line_cut", fields)
+
+
+def test_a_cut_off_line_is_looked_at_again_after_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a"
+    file = TextFile(settings(path, "csv"))
+    file.send([reading(1520.5)])
+    file.close()
+    whole = path.read_bytes()
+    path.write_bytes(whole + whole.splitlines()[1][:-3])
+
+    def fails(*_: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(text_file, "_end_line", fails)
+        with pytest.raises(OSError, match="Input/output error"):
+            file.send([reading(1520.5)])
+    file.send([reading(1520.5)])
+    file.close()
+    assert path.read_bytes() == whole + whole.splitlines(keepends=True)[1]
 
 
 @pytest.mark.parametrize("kind", ["csv", "influx"])

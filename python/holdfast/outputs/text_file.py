@@ -78,7 +78,11 @@ class TextFile(Receiver):
         if self._open is None:
             self._rotation.take_up()
             self._open = self._file.open("ab", buffering=0)
-            _end_line(self._open, self._file, self._form)
+            try:
+                _end_line(self._open, self._file, self._form)
+            except OSError:
+                self.close()  # The next row would go on with what was not looked at.
+                raise
         size = self._open.seek(0, os.SEEK_END)
         if size and size + more > self._max_bytes and self._rotation.may_rotate:
             self.close()

@@ -1,4 +1,4 @@
-"""The lock of an audit log on Windows, with a module in the place of `msvcrt`."""
+"""The lock of a file on Windows, with a module in the place of `msvcrt`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.events.audit import lock as own
+from holdfast.events import file_lock as own
 
 if TYPE_CHECKING:
     from pathlib import Path
