@@ -257,6 +257,25 @@ def test_what_the_source_did_not_read_is_left_out(read: Callable[[str], Imported
     ]
 
 
+def test_a_comment_that_is_no_device_ends_neither_device_nor_poll(
+    read: Callable[[str], Imported],
+) -> None:
+    form = "# device,<device_name>,<device_id>\n"
+    found = read(
+        "# plant of 2024\n# device,typical,1 <- the first one\ndevice,plant,1\n"
+        f"poll,holding_register,0,10,BE_BE\n{form}ref,one,0,int16,r\n#device,spare,2\n"
+    )
+    assert {name: list(each["tags"]) for name, each in found.data["devices"].items()} == {
+        "plant": ["one"]
+    }
+    assert notes(found) == [
+        "2: typical: left out: found '1 <- the first one', no unit id; the source ignored it",
+        "5: '<device_name>': left out: found '<device_id>', no unit id; the source ignored it",
+        "7: spare: check: '#device' is a device, as in the source",
+        "7: spare: left out: no reference of it is read",
+    ]
+
+
 @pytest.mark.parametrize(
     ("second", "gap"), [(10, 7), (17, 6), (40, 7)], ids=["adjacent", "near", "far"]
 )

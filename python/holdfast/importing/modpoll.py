@@ -208,6 +208,11 @@ def _devices(desk: Desk, rows: _Rows) -> Iterator[_Device]:
     poll: _Poll | None = None
     for kind, path, cells in rows.found:
         is_whole = len(cells) >= _MIN_CELLS[kind]
+        is_comment = cells[0].lstrip().startswith("#")
+        if kind == "device" and is_comment and is_whole and _integer(cells[2]) is None:
+            # A comment on the form of devices: what follows is of the device before it.
+            desk.left_out(path, f"found {show(cells[2])}, no unit id; the source ignored it")
+            continue
         if cells[0].strip().lower() != kind and is_whole:
             desk.check(path, f"{show(cells[0])} is a {kind}, as in the source")
         if kind == "device" and (is_whole or cells[0].strip().lower() == kind):
