@@ -174,12 +174,33 @@ def test_each_value_of_a_structure_is_a_sensor(
 
 def test_a_structure_of_several_kinds_is_left_out(imported: Callable[..., Imported]) -> None:
     found = imported(
-        "sensors: [{name: x, address: 1, data_type: custom, structure: '>hf', count: 3}, "
+        "sensors: [{name: x, address: 1, data_type: custom, structure: '>hf', count: 3, scale: 2}, "
         "{name: y, address: 9}]"
     )
     assert list(tags(found)) == ["y"]
     message = "left out: x has the structure '>hf', which is no type here: add a tag for each value"
-    assert f"8: modbus[0].sensors[0]: {message}" in notes(found)
+    assert [note for note in notes(found) if "left out" in note] == [
+        f"8: modbus[0].sensors[0]: {message}"
+    ]
+
+
+def test_an_entity_with_a_scale_of_0_is_left_out(imported: Callable[..., Imported]) -> None:
+    found = imported(
+        "sensors: [{name: x, address: 1, scale: 0, unit_of_measurement: W, virtual_count: 2}, "
+        "{name: text, address: 2, data_type: string, count: 2, scale: 0}]\n"
+        "    climates:\n"
+        "      - {name: y, address: 3, target_temp_register: 4, current_temp_scale: 0, scale: 2}\n"
+        "      - {name: z, address: 5, target_temp_register: 6, target_temp_scale: 0, "
+        "hvac_onoff_coil: 7}"
+    )
+    assert list(tags(found)) == ["text", "z_power"]
+    message = "has a scale of 0, with which all numbers are one value: add a tag"
+    assert [note for note in notes(found) if "left out" in note] == [
+        f"8: modbus[0].sensors[0]: left out: x {message}",
+        "8: modbus[0].sensors[1].scale: left out: a text has none",
+        f"10: modbus[0].climates[0]: left out: y {message}",
+        f"11: modbus[0].climates[1]: left out: z {message}",
+    ]
 
 
 def test_types_of_former_versions(imported: Callable[..., Imported]) -> None:
@@ -532,14 +553,14 @@ def test_a_serial_line_and_pauses_are_in_the_url(imported: Callable[..., Importe
 def test_every_mistake_is_told_with_its_line(imported: Callable[..., Imported]) -> None:
     with pytest.raises(NotImportable) as raised:
         imported(
-            "sensors: [{name: a, address: -1}, {address: 2}, {name: b, address: 1, scale: 0}, "
+            "sensors: [{name: a, address: -1}, {address: 2}, {name: b, address: 1, count: 0}, "
             "{name: c, address: 1, data_type: string}, {name: d, address: 1, slave: 300}]\n"
             "    switches: !include switches.yaml"
         )
     assert [(each.line, each.key) for each in raised.value.problems] == [
         (8, "modbus[0].sensors[0].address"),
         (8, "modbus[0].sensors[1].name"),
-        (8, "modbus[0].sensors[2].scale"),
+        (8, "modbus[0].sensors[2].count"),
         (8, "modbus[0].sensors[3].count"),
         (8, "modbus[0].sensors[4].slave"),
         (9, "modbus[0].switches"),

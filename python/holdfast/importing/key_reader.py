@@ -138,6 +138,11 @@ class Section:
         self._wrong(key, value, either(allowed))
         return None
 
+    def leave_out(self, message: str) -> None:
+        """Notes that the result does not have what this mapping describes, with all its keys."""
+        self.desk.left_out(self.path, message)
+        self._asked.update(self.data)
+
     def close(self, reasons: Mapping[str, str] | None = None) -> None:
         """Adds a note for every unread key, with the reason if it is known."""
         if self._has_problem():  # Keys may be unread because of it.

@@ -117,6 +117,8 @@ def _sensor(places: Places, entity: Section) -> None:
         for key in [key for key, value in scaled.items() if value is not None]:
             entity.desk.left_out(entity.at(key), "a text has none")
             scaled[key] = None
+    if _is_constant(entity, scaled):
+        return
     found = parsed(settings["type"])
     if found.count is not None:
         message = "a sensor for each value; the source had one text"
@@ -147,10 +149,16 @@ def _scaled(entity: Section, prefix: str = "") -> dict[str, Any]:
         own = entity.number(f"{prefix}{key}") if prefix else None
         value = entity.number(key) if own is None else own
         found[key] = None if value == plain else value
-        if key == "scale" and value == 0:
-            at = entity.at(key if own is None else f"{prefix}{key}")
-            entity.desk.problem(at, "found 0, allowed: any other number")
     return found
+
+
+def _is_constant(entity: Section, *scaled: dict[str, Any]) -> bool:
+    """Whether a scale is 0, which no tag can have: such an entity is left out."""
+    if all(each["scale"] != 0 for each in scaled):
+        return False
+    message = f"{_name(entity)} has a scale of 0, with which all numbers are one value: add a tag"
+    entity.leave_out(message)
+    return True
 
 
 def _typed(entity: Section) -> dict[str, Any] | None:
@@ -190,7 +198,7 @@ def _structure(
     number = int(found[2] or 1) if found else 0
     if found is None or not number:
         message = f"{_name(entity)} has the structure {show(structure)}, which is no type here"
-        entity.desk.left_out(entity.path, f"{message}: add a tag for each value")
+        entity.leave_out(f"{message}: add a tag for each value")
         return None
     kind = _kind(found, number, count)
     if count not in (None, register_count(kind)):
@@ -398,7 +406,7 @@ def _climate(places: Places, entity: Section) -> None:
         message = f"values of type {settings['type']} are no temperatures: add a tag"
         entity.desk.left_out(entity.path, message)
         return
-    if address is None or settings is None or not target:
+    if _is_constant(entity, current, aim) or address is None or settings is None or not target:
         return
     entity.desk.changed(entity.path, "a sensor, a number and selects instead of a thermostat")
     modes: dict[int, list[str]] = {}
