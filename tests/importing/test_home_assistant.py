@@ -643,6 +643,31 @@ def test_merged_keys_are_those_of_the_entity_unless_it_has_its_own(
     assert [tag["order"] for tag in found_tags.values()] == ["CDAB"] * 3
 
 
+def test_the_last_of_equal_keys_counts_as_in_the_source(
+    imported: Callable[..., Imported], tmp_path: Path
+) -> None:
+    (tmp_path / "secrets.yaml").write_text("host: 10.0.0.8\nhost: 10.0.0.9\n")
+    first = HUB.replace("{entities}", "sensors: [{name: a, address: 1}]")
+    second = HUB.partition("\n")[2].replace("192.168.1.50", "!secret host")
+    found = imported("sensors: [{name: b, slave: 3, address: 2, address: 4}]", first + second)
+    device = found.data["devices"]["inverter"]
+    assert (device["url"], device["unit"]) == ("tcp://10.0.0.9:502", 3)
+    assert {name: tag["address"] for name, tag in device["tags"].items()} == {"b": 4}
+    last = "the last counts, as in the source"
+    assert [note for note in notes(found) if last in note] == [
+        f"10: modbus: check: line 3 has it, too: {last}",
+        f"15: modbus[0].sensors[0].address: check: line 15 has it, too: {last}",
+    ]
+
+
+def test_the_last_of_several_merge_keys_counts_as_in_the_source(
+    imported: Callable[..., Imported],
+) -> None:
+    hub = HUB.replace("default_config:", "x: &x {scale: 2, offset: 3}\ny: &y {scale: 4}")
+    tag = tags(imported("sensors: [{<<: *x, <<: *y, name: a, address: 1}]", hub))["a"]
+    assert (tag["scale"], tag["offset"]) == (4, 3)
+
+
 def test_the_section_is_found_in_a_package(imported: Callable[..., Imported]) -> None:
     inside = "".join(f"      {line}\n" for line in HUB.splitlines()[2:])
     hub = f"homeassistant:\n  packages:\n    pv:\n{inside}"

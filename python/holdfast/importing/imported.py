@@ -66,7 +66,8 @@ class Source:
     def __init__(self, path: Path | str, resolve: Resolve | None = None) -> None:
         """Raises `ConfigError` for a file that can't be read.
 
-        `resolve` gives tags of the source a value; such a source also accepted merge keys.
+        `resolve` gives tags of the source a value; such a source also accepted merge keys, and
+        took the last of equal keys.
         """
         self.file = str(path)
         text = yaml_document.read_text(Path(path), self.file)
@@ -87,12 +88,17 @@ class Source:
             each for each in self.problems if any(_is_in(key, each.key) for key in keys)
         ]
         self.desk.report.found.clear()
+        self.desk.noted.clear()
         for path in paths:
             self._look_at(path, self.desk.report.raw(path))
 
     def _look_at(self, path: KeyPath, value: object) -> None:
         self.desk.broken = {each.key for each in self.problems}
         self._refuse_octal(self._lines, path, value)
+        for repeated, line in self.desk.document.repeated:
+            if all(one == other for one, other in zip(path, repeated, strict=False)):
+                message = f"line {line} has it, too: the last counts, as in the source"
+                self.desk.check(repeated, message)
 
     def is_mapping(self) -> bool:
         """Whether the file contains a mapping; adds a problem otherwise."""

@@ -89,6 +89,8 @@ class Document:
     file: str
     data: Any
     root: _Spot
+    repeated: tuple[tuple[KeyPath, int], ...] = ()
+    """The keys that were given before in their mapping, and in which line."""
 
     def place(self, path: KeyPath, *, of_key: bool = False) -> Place:
         """The place of a scalar value; for a list or mapping, the place of its key.
@@ -193,9 +195,9 @@ def parse(
     """Returns the document and its problems. Raises `ConfigError` if the YAML is not valid.
 
     For files of other programs: `resolve` gives scalars with a tag of their own a value, which must
-    be a scalar. With `merges`, the key `<<` adds the keys of other mappings that are not there.
-    `max_values` counts values with aliases expanded. `room` is a number of keys and values that is
-    allowed in any case.
+    be a scalar. With `merges`, the key `<<` adds the keys of other mappings that are not there, and
+    the last of equal keys counts. `max_values` counts values with aliases expanded. `room` is a
+    number of keys and values that is allowed in any case.
     """
     max_written, max_values = max(MAX_WRITTEN, room), max(max_values, room)
     if found := _NOT_ALLOWED.search(text):
@@ -213,7 +215,7 @@ def parse(
     if spot.values > max_values:
         message = f"found {spot.values} values with aliases expanded, allowed: up to {max_values}"
         raise ConfigError(file, [Problem(file, 1, 1, "", message)])
-    document = Document(file, data, spot)
+    document = Document(file, data, spot, tuple(reader.repeated))
     return document, [
         Problem(file, place.line, place.column, document.spell(path), message)
         for place, path, message in reader.mistakes
@@ -247,6 +249,7 @@ class _Reader:
         """The mistakes inside an anchor, which are also those of its aliases: only a part of a file
         of another program may be read."""
         self.mistakes: list[tuple[Place, KeyPath, str]] = []
+        self.repeated: list[tuple[KeyPath, int]] = []
         self._events = iter(events)
         self._left = max_written
         self._anchors: dict[int | str, tuple[Any, _Spot] | None] = {}
@@ -326,6 +329,8 @@ class _Reader:
                 message = "found a merge key, allowed: the keys themselves"
                 self._add(event, (*path, key), message)
                 key = None
+            elif key in data and self._merges:
+                self.repeated.append(((*path, key), spot.children[key][0].line))
             elif key in data:
                 first = spot.children[key][0].line
                 name = str(key) if isinstance(key, int) else show(key)
@@ -339,7 +344,7 @@ class _Reader:
             data[key] = value
             spot.children[key] = (_place(event), child)
             spot.values += child.values
-        for event, value, child in merged:
+        for event, value, child in reversed(merged):
             if isinstance(value, dict | list):
                 self._merge(data, spot, value, child)
             elif value is not None:

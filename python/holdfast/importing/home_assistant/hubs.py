@@ -123,7 +123,8 @@ class _Tags:
             return {}
         name = str(self._file)
         try:
-            data = yaml_document.parse(yaml_document.read_text(self._file, name), name)[0].data
+            text = yaml_document.read_text(self._file, name)
+            data = yaml_document.parse(text, name, merges=True)[0].data
         except ConfigError:
             raise ValueError(f"found a secret, but {name} is not YAML that can be read") from None
         return data if isinstance(data, dict) else {}
