@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.cli import main
-from holdfast.config import load
+from holdfast.config import ConfigError, load
 from holdfast.importing import NotImportable, read_home_assistant
 from holdfast.values import decode, register_count
 
@@ -578,7 +579,7 @@ def test_secrets_are_read_from_the_file_beside_it(
     sensors = "sensors: [{name: a, address: 1}]"
     with pytest.raises(NotImportable) as raised:
         imported(sensors, hub)
-    missing = "which is not in secrets.yaml beside this file, allowed: its value"
+    missing = "which is not in secrets.yaml beside the imported file, allowed: its value"
     assert refusals(raised.value) == [
         f"6: modbus[0].host: found the secret host, {missing}",
         f"7: modbus[0].port: found the secret port, {missing}",
@@ -586,6 +587,127 @@ def test_secrets_are_read_from_the_file_beside_it(
     (tmp_path / "secrets.yaml").write_text("host: 10.0.0.9\nport: 1502\n")
     device = imported(sensors, hub).data["devices"]["inverter"]
     assert device["url"] == "tcp://10.0.0.9:1502"
+
+
+def test_files_that_are_included_are_read_where_they_are(
+    imported: Callable[..., Imported], tmp_path: Path
+) -> None:
+    for folder in ("packages", "entities"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "secrets.yaml").write_text("host: 10.0.0.1\nport: 1502\n")
+    (tmp_path / "packages" / "secrets.yaml").write_text("host: 10.0.0.2\n")
+    (tmp_path / "hubs.yaml").write_text(
+        "- &hub {name: one, type: tcp, host: !secret host, port: !secret port, "
+        "sensors: !include entities/a.yaml}\n"
+        "- {<<: *hub, name: two, host: 10.0.0.3, sensors: [!include entities/b.yaml]}\n"
+    )
+    (tmp_path / "packages" / "pv.yaml").write_text(
+        "modbus:\n  name: pv\n  type: tcp\n  host: !secret host\n  port: !secret port\n"
+        "  sensors: !include ../entities/a.yaml\n  switches: !include ../entities/none.yaml\n"
+    )
+    (tmp_path / "entities" / "a.yaml").write_text(
+        "- {name: a, address: 1, slave: 7}\n- &b {name: b, address: 2, slave: 7, precision: 1}\n"
+    )
+    (tmp_path / "entities" / "b.yaml").write_text("name: c\nslave: 7\naddress: 3\naddress: 4\n")
+    (tmp_path / "entities" / "none.yaml").write_text("# none yet\n")
+    (tmp_path / "automations.yaml").write_text(
+        "- action: modbus.write_register\n  data: {hub: pv, slave: 7, address: 2, value: 1}\n"
+    )
+    found = imported(
+        "",
+        "homeassistant: {packages: {pv: !include packages/pv.yaml}}\n"
+        "automation: !include automations.yaml\nmodbus: !include hubs.yaml\n",
+    )
+    assert {
+        name: (each["url"], list(each["tags"])) for name, each in found.data["devices"].items()
+    } == {
+        "one": ("tcp://10.0.0.1:1502", ["a", "b"]),
+        "two": ("tcp://10.0.0.3:1502", ["c"]),
+        "pv": ("tcp://10.0.0.2:1502", ["a", "b"]),
+    }
+    places = {
+        (Path(note.file).relative_to(tmp_path).as_posix(), note.line, note.key)
+        for note in found.notes
+    }
+    assert places >= {
+        ("automations.yaml", 1, "automation[0].action"),
+        ("entities/a.yaml", 2, "modbus[0].sensors[1].precision"),
+        ("entities/b.yaml", 4, "modbus[1].sensors[0].address"),
+    }
+
+
+def test_a_problem_of_an_included_file_has_its_name_and_line(
+    imported: Callable[..., Imported], tmp_path: Path
+) -> None:
+    for name, text in {
+        "a.yaml": "- {name: a, address: 0100}\n- name: b\n- !secret missing\n",
+        "b.yaml": "x:\n  password: a: b\n",
+        "c.yaml": "!include c.yaml\n",
+        "d.yaml": "!include_dir_list d\n",
+        "e.yaml": "- {<<: !include ../outside.yaml, name: x, address: 1}\n",
+    }.items():
+        (tmp_path / name).write_text(text)
+    (tmp_path.parent / "outside.yaml").write_text("name: x\n")
+    lists = ("sensors", "switches", "covers", "climates", "lights", "fans")
+    with pytest.raises(NotImportable) as raised:
+        imported(
+            "\n    ".join(
+                f"{each}: !include {name}.yaml" for each, name in zip(lists, "abcdef", strict=True)
+            )
+        )
+    found = [
+        f"{Path(each.file).name}:{each.line}: {each.key.removeprefix('modbus[0].')}: {each.message}"
+        for each in raised.value.problems
+    ]
+    assert [each.replace(f"{tmp_path}{os.sep}", "") for each in found] == [
+        "configuration.yaml:13: fans: found !include f.yaml, but f.yaml: can't be read: "
+        "No such file or directory",
+        "a.yaml:1: sensors[0].address: found 0100, which the source read as octal, allowed: 64, "
+        "or 100 if that is meant",
+        "a.yaml:2: sensors[1].address: missing, allowed: an address from 0 to 65535",
+        "a.yaml:3: sensors[2]: found the secret missing, which is not in secrets.yaml beside the "
+        "imported file, allowed: its value",
+        "b.yaml:2: switches: not YAML (line hidden, as it may contain a secret), allowed: text in "
+        "quotes",
+        "c.yaml:1: covers: found c.yaml, allowed: up to 10 files inside each other, none inside "
+        "itself",
+        "d.yaml:1: climates: found !include_dir_list d, allowed: !include of each file; a file "
+        "with hubs can be imported by itself",
+        "e.yaml:1: lights[0].'<<': found !include ../outside.yaml, allowed: a file in the folder "
+        "of the imported one, or below it",
+    ]
+
+
+def test_a_link_does_not_lead_out_of_the_folder(
+    imported: Callable[..., Imported], tmp_path: Path
+) -> None:
+    (tmp_path.parent / "linked.yaml").write_text("- {name: a, address: 1}\n")
+    (tmp_path / "a.yaml").symlink_to(tmp_path.parent / "linked.yaml")
+    with pytest.raises(NotImportable, match="allowed: a file in the folder of the imported one"):
+        imported("sensors: !include a.yaml")
+
+
+def test_files_that_include_others_again_and_again_are_refused(
+    imported: Callable[..., Imported], tmp_path: Path
+) -> None:
+    for number in range(8):
+        inside = ", ".join([f"!include {number + 1}.yaml"] * 9)
+        (tmp_path / f"{number}.yaml").write_text(f"[{inside}]\n")
+    (tmp_path / "8.yaml").write_text("name: x\n")
+    with pytest.raises(ConfigError, match="allowed: 300 of them in all files"):
+        imported("sensors: !include 0.yaml")
+    (tmp_path / "8.yaml").write_text(f"[{'1, ' * 2000}]\n")
+    with pytest.raises(ConfigError, match="more than 300000 keys and values, the limit"):
+        imported("sensors: !include 0.yaml")
+
+
+def test_packages_that_are_not_read_are_noted(imported: Callable[..., Imported]) -> None:
+    core = "homeassistant: {name: !secret home, packages: !include_dir_named packages}"
+    found = imported("sensors: [{name: a, address: 1}]", HUB.replace("default_config:", core))
+    message = "found !include_dir_named packages, allowed: !include of each file; a file with hubs"
+    assert [note for note in notes(found) if "left out" in note] == [
+        f"1: homeassistant.packages: left out: {message} can be imported by itself"
+    ]
 
 
 def test_all_sections_are_read(imported: Callable[..., Imported]) -> None:
@@ -601,7 +723,7 @@ def test_a_problem_of_an_anchor_elsewhere_is_one_of_its_alias(
     hub = HUB.replace("default_config:", "base: &base {data_type: !secret kind, scale: 0.1}")
     with pytest.raises(NotImportable) as raised:
         imported("sensors: [{<<: *base, name: a, address: 1}]", hub)
-    missing = "which is not in secrets.yaml beside this file, allowed: its value"
+    missing = "which is not in secrets.yaml beside the imported file, allowed: its value"
     assert refusals(raised.value) == [
         f"8: modbus[0].sensors[0].'<<': found the secret kind, {missing}"
     ]

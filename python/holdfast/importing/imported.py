@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from holdfast.config.dump import to_yaml
 from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
-from holdfast.config.text.problems import ConfigError
+from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.importing.notes import Desk, Note
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from holdfast.config.text.problems import Problem
     from holdfast.config.text.yaml_document import KeyPath, Resolve
 
 Generation: TypeAlias = Literal[1, 2]
@@ -71,30 +70,43 @@ class Source:
         """
         self.file = str(path)
         text = yaml_document.read_text(Path(path), self.file)
+        self._lines = {self.file: text.splitlines()}
+        """The lines of each file."""
+
+        def known(kind: str, text: str, file: str) -> Any:
+            assert resolve is not None, "only with it are tags given a value"
+            found = resolve(kind, text, file)
+            if isinstance(found, yaml_document.Included):
+                self._lines[found.file] = found.text.splitlines()
+            return found
+
         try:
             merges = resolve is not None
-            document, found = yaml_document.parse(text, self.file, resolve, merges=merges)
+            document, found = yaml_document.parse(
+                text, self.file, known if merges else None, merges=merges
+            )
         except ConfigError as error:
-            raise ConfigError(self.file, _without_secrets(text, error.problems)) from None
-        self.problems = _without_secrets(text, found)
+            raise ConfigError(self.file, self._without_secrets(error.problems)) from None
+        self.problems = self._without_secrets(found)
         self.desk = Desk(document)
-        self._lines = text.splitlines()
         self._look_at((), document.data)
 
-    def narrow(self, paths: Sequence[KeyPath]) -> None:
-        """Reads nothing but the values at these paths: problems elsewhere do not matter."""
+    def narrow(self, paths: Sequence[KeyPath]) -> list[Problem]:
+        """Reads nothing but the values at these paths. Returns the problems elsewhere."""
         keys = [self.desk.document.spell(path) for path in paths]
-        self.problems = [
-            each for each in self.problems if any(_is_in(key, each.key) for key in keys)
-        ]
+        found, self.problems, elsewhere = self.problems, [], list[Problem]()
+        for each in found:
+            is_inside = any(_is_in(key, each.key) for key in keys)
+            (self.problems if is_inside else elsewhere).append(each)
         self.desk.report.found.clear()
         self.desk.noted.clear()
         for path in paths:
             self._look_at(path, self.desk.report.raw(path))
+        return elsewhere
 
     def _look_at(self, path: KeyPath, value: object) -> None:
         self.desk.broken = {each.key for each in self.problems}
-        self._refuse_octal(self._lines, path, value)
+        self._refuse_octal(path, value)
         for repeated, line in self.desk.document.repeated:
             if all(one == other for one, other in zip(path, repeated, strict=False)):
                 message = f"line {line} has it, too: the last counts, as in the source"
@@ -108,18 +120,31 @@ class Source:
             self.desk.problem((), f"found {found}, allowed: a mapping")
         return isinstance(data, dict)
 
-    def _refuse_octal(self, lines: Sequence[str], path: KeyPath, value: object) -> None:
+    def _refuse_octal(self, path: KeyPath, value: object) -> None:
         """Adds a problem for each integer that is octal for the source, but not here."""
         if isinstance(value, dict | list):
             inside = value.items() if isinstance(value, dict) else enumerate(value)
             for key, each in inside:
-                self._refuse_octal(lines, (*path, key), each)
+                self._refuse_octal((*path, key), each)
         elif type(value) is int:
             place = self.desk.document.place(path)
-            written = _OCTAL.match(" ".join(lines[place.line - 1 : place.line]), place.column - 1)
+            written = _OCTAL.match(self._line(place.file, place.line), place.column - 1)
             if written is not None and (octal := int(written[0], 8)) != value:
                 message = f"found {written[0]}, which the source read as octal, allowed: {octal}"
                 self.desk.problem(path, f"{message}, or {value} if that is meant")
+
+    def _without_secrets(self, problems: Iterable[Problem]) -> list[Problem]:
+        """Hides what a YAML error quotes from a line that may contain a secret."""
+        hidden = "not YAML (line hidden, as it may contain a secret), allowed: text in quotes"
+        return [
+            replace(problem, message=hidden)
+            if problem.line and _SECRET.search(self._line(problem.file, problem.line))
+            else problem
+            for problem in problems
+        ]
+
+    def _line(self, file: str, line: int) -> str:
+        return " ".join(self._lines[file][line - 1 : line])
 
     def finish(self) -> None:
         """Raises `NotImportable` if there was any problem."""
@@ -131,15 +156,3 @@ class Source:
 def _is_in(section: str, key: str) -> bool:
     """Whether the key of a problem is that of a section, or one inside it."""
     return key == section or key.startswith((f"{section}.", f"{section}["))
-
-
-def _without_secrets(text: str, problems: Iterable[Problem]) -> list[Problem]:
-    """Hides what a YAML error quotes from a line that may contain a secret."""
-    lines = text.splitlines()
-    hidden = "not YAML (line hidden, as it may contain a secret), allowed: text in quotes"
-    return [
-        replace(problem, message=hidden)
-        if problem.line and _SECRET.search(" ".join(lines[problem.line - 1 : problem.line]))
-        else problem
-        for problem in problems
-    ]

@@ -182,10 +182,11 @@ class Section:
 
 
 def section(desk: Desk, path: KeyPath, value: object) -> Section | None:
-    """The mapping at `path`; adds a problem for any other value."""
+    """The mapping at `path`; adds a problem for any other value that could be read."""
     if isinstance(value, dict):
         return Section(desk, path, value)
-    desk.problem(path, f"found {show(value)}, allowed: a mapping")
+    if desk.document.spell(path) not in desk.broken:
+        desk.problem(path, f"found {show(value)}, allowed: a mapping")
     return None
 
 

@@ -14,6 +14,7 @@ from holdfast.config.text.report import Report
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from holdfast.config.text.problems import Problem
     from holdfast.config.text.yaml_document import Document, KeyPath
     from holdfast.types import Area
 
@@ -56,8 +57,12 @@ class Desk:
 
     @property
     def notes(self) -> tuple[Note, ...]:
-        """The notes in the order of the file, each once."""
-        notes = sorted(self.noted, key=lambda note: (note.line, note.column))
+        """The notes in the order of the file, then those of files inside it, each once."""
+
+        def order(note: Note) -> tuple[bool, str, int, int]:
+            return (note.file != self.document.file, note.file, note.line, note.column)
+
+        notes = sorted(self.noted, key=order)
         if not self.folds:
             return tuple(notes)
         alike: dict[tuple[str, str, str], list[Note]] = {}
@@ -73,11 +78,18 @@ class Desk:
         """Adds a note about the key at `path`."""
         place = self.document.place(path, of_key=True)
         key = self.document.spell(path)
-        self.noted[Note(kind, self.document.file, place.line, place.column, key, message)] = None
+        self.noted[Note(kind, place.file, place.line, place.column, key, message)] = None
 
     def left_out(self, path: KeyPath, message: str) -> None:
         """Notes that the result does not have the key at `path`."""
         self.note("left out", path, message)
+
+    def left_out_for(self, problem: Problem) -> None:
+        """Notes that the result does not have what has this problem, which does not matter."""
+        assert problem.line is not None, "a problem inside a file has a line"
+        assert problem.column is not None, "and a column"
+        place = (problem.file, problem.line, problem.column)
+        self.noted[Note("left out", *place, problem.key, problem.message)] = None
 
     def changed(self, path: KeyPath, message: str) -> None:
         """Notes that the key at `path` is converted differently."""

@@ -66,7 +66,7 @@ class Report:
         if self._of_many(path):
             path = ("devices", self.templates[path[1]], *path[2:])
         key = self.document.spell(path)
-        return Problem(self.document.file, place.line, place.column, key, message)
+        return Problem(place.file, place.line, place.column, key, message)
 
     def raw(self, path: KeyPath) -> Any:
         """The value at `path` as it is in the file."""

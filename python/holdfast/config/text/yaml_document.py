@@ -26,8 +26,9 @@ if TYPE_CHECKING:
 
 Key: TypeAlias = str | int
 KeyPath: TypeAlias = tuple[Key, ...]
-Resolve: TypeAlias = "Callable[[str, str], Any]"
-"""Returns the value of a scalar by its tag and text. Raises `ValueError`."""
+Resolve: TypeAlias = "Callable[[str, str, str], Any]"
+"""Returns the value of a scalar by its tag, its text and its file, or an `Included`. Raises
+`ValueError`."""
 
 MAX_BYTES = 1 << 20
 """The size limit of a file. It has room for 6,300 devices, which take about 2 s and 80 MB."""
@@ -37,6 +38,9 @@ MAX_WRITTEN = 300_000
 
 MAX_VALUES = 1_000_000
 """Maximum number of values in one file, with aliases expanded."""
+
+_MAX_DEPTH = 10
+"""Maximum number of files inside each other."""
 
 _TAG = "tag:yaml.org,2002:"
 _WORDS: Final[dict[str, bool | None]] = {
@@ -52,9 +56,18 @@ _SPECIAL = re.compile(r"(?P<inf>[-+]?\.(inf|Inf|INF))|\.(nan|NaN|NAN)")
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """A line and a column, both from 1."""
+class Included:
+    """The text of another file, whose value is that of a scalar."""
 
+    file: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A line and a column of a file, both from 1."""
+
+    file: str
     line: int
     column: int
 
@@ -84,7 +97,7 @@ _NO_CHILDREN: Final[dict[Key, tuple[Place, _Spot]]] = {}
 
 @dataclass(frozen=True)
 class Document:
-    """The data of one file; `root` has the place of each value."""
+    """The data of one file, with that of files inside it; `root` has the place of each value."""
 
     file: str
     data: Any
@@ -139,7 +152,7 @@ def table(file: str, data: Any, lines: Mapping[KeyPath, int]) -> Document:
         line = lines.get(path, line)
         inside = dict(enumerate(value)) if isinstance(value, list) else value
         kind = _Kind.LIST if isinstance(value, list) else _Kind.MAPPING
-        made = _Spot(Place(line, 1), kind=kind if isinstance(inside, dict) else _Kind.SCALAR)
+        made = _Spot(Place(file, line, 1), kind=kind if isinstance(inside, dict) else _Kind.SCALAR)
         if isinstance(inside, dict):
             for key, each in inside.items():
                 child = spot(each, (*path, key), line)
@@ -195,18 +208,13 @@ def parse(
     """Returns the document and its problems. Raises `ConfigError` if the YAML is not valid.
 
     For files of other programs: `resolve` gives scalars with a tag of their own a value, which must
-    be a scalar. With `merges`, the key `<<` adds the keys of other mappings that are not there, and
-    the last of equal keys counts. `max_values` counts values with aliases expanded. `room` is a
-    number of keys and values that is allowed in any case.
+    be a scalar, or that of another file. With `merges`, the key `<<` adds the keys of other
+    mappings that are not there, and the last of equal keys counts. `max_values` counts values with
+    aliases expanded. `room` is a number of keys and values that is allowed in any case.
     """
     max_written, max_values = max(MAX_WRITTEN, room), max(max_values, room)
-    if found := _NOT_ALLOWED.search(text):
-        line = text[: found.start()].count("\n") + 1
-        raise _error(file, f"the character U+{ord(found[0]):04X} is not allowed in YAML", line)
     try:
-        # Text without a value has no events, from either parser.
-        events = yaml_events(text, max_written) or _slow_events(text, file)
-        reader = _Reader(events, resolve, merges=merges, max_written=max_written)
+        reader = _Reader(text, file, resolve, merges=merges, max_written=max_written)
     except _TooMany:
         raise _error(file, f"more than {max_written} keys and values, the limit") from None
     except RecursionError:
@@ -217,13 +225,21 @@ def parse(
         raise ConfigError(file, [Problem(file, 1, 1, "", message)])
     document = Document(file, data, spot, tuple(reader.repeated))
     return document, [
-        Problem(file, place.line, place.column, document.spell(path), message)
+        Problem(place.file, place.line, place.column, document.spell(path), message)
         for place, path, message in reader.mistakes
     ]
 
 
 class _TooMany(Exception):
     """A file has too many keys and values."""
+
+
+def _events(text: str, file: str, max_written: int) -> Iterable[YamlEvent]:
+    if found := _NOT_ALLOWED.search(text):
+        line = text[: found.start()].count("\n") + 1
+        raise _error(file, f"the character U+{ord(found[0]):04X} is not allowed in YAML", line)
+    # Text without a value has no events, from either parser.
+    return yaml_events(text, max_written) or _slow_events(text, file)
 
 
 def _slow_events(text: str, file: str) -> Iterator[YamlEvent]:
@@ -233,16 +249,19 @@ def _slow_events(text: str, file: str) -> Iterator[YamlEvent]:
 
 
 class _Reader:
-    """Makes data of the events of one document."""
+    """Makes data of the text of one document."""
 
     def __init__(
         self,
-        events: Iterable[YamlEvent],
+        text: str,
+        file: str,
         resolve: Resolve | None,
         *,
         merges: bool,
         max_written: int,
     ) -> None:
+        self._files: tuple[str, ...] = (file,)
+        """The files inside each other whose events are read; the last one is the innermost."""
         self._resolve = resolve
         self._merges = merges
         self._mistakes_of: dict[int | str, list[str]] = {}
@@ -250,14 +269,19 @@ class _Reader:
         of another program may be read."""
         self.mistakes: list[tuple[Place, KeyPath, str]] = []
         self.repeated: list[tuple[KeyPath, int]] = []
-        self._events = iter(events)
+        self._events = iter(_events(text, file, max_written))
         self._left = max_written
         self._anchors: dict[int | str, tuple[Any, _Spot] | None] = {}
         """What an anchor names, `None` while its value is being read."""
+        self.document: Final = self._document(())
+
+    def _document(self, path: KeyPath) -> tuple[Any, _Spot]:
         first = next(self._events, None)
-        empty = None, _Spot(Place(1, 1), kind=_Kind.SCALAR)
-        self.document: Final = empty if first is None else self._value(first, ())
+        if first is None:
+            return None, _Spot(Place(self._files[-1], 1, 1), kind=_Kind.SCALAR)
+        value = self._value(first, path)
         next(self._events, None)  # Raises what follows the document and is not allowed there.
+        return value
 
     def _value(self, event: YamlEvent, path: KeyPath) -> tuple[Any, _Spot]:
         self._left -= 1
@@ -285,7 +309,7 @@ class _Reader:
         return self._refused(event, path, "an alias inside its own anchor is not allowed")
 
     def _new_value(self, event: YamlEvent, path: KeyPath) -> tuple[Any, _Spot]:
-        what, line, column, _, tag, text = event
+        what, _, _, _, tag, text = event
         if text is not None:
             kind = "" if tag is None and what == "plain" else (tag or "!").removeprefix(_TAG)
             try:
@@ -293,31 +317,52 @@ class _Reader:
                 if kind == "!":
                     data = text
                 elif kind.startswith("!") and self._resolve is not None:
-                    data = self._resolve(kind, text)
+                    data = self._resolve(kind, text, self._files[-1])
                 else:
                     data = scalar(text, kind)
             except ValueError as error:
                 return self._refused(event, path, str(error))
+            if isinstance(data, Included):
+                return self._included(event, path, data)
             empty = text == "" and what == "plain"
             form = _Kind.EMPTY if empty else _Kind.SCALAR
-            return data, _Spot(Place(line, column), _NO_CHILDREN, form)
+            return data, _Spot(self._place(event), _NO_CHILDREN, form)
         value = self._list(event, path) if what == "list" else self._mapping(event, path)
         if tag in (None, "!", f"{_TAG}seq" if what == "list" else f"{_TAG}map"):
             return value
         return self._refused(event, path, f"the tag {tag!r} is not allowed")
 
+    def _included(self, event: YamlEvent, path: KeyPath, included: Included) -> tuple[Any, _Spot]:
+        outside = self._files, self._events, self._anchors, self._mistakes_of
+        if included.file in self._files or len(self._files) == _MAX_DEPTH:
+            allowed = f"allowed: up to {_MAX_DEPTH} files inside each other, none inside itself"
+            return self._refused(event, path, f"found {included.file}, {allowed}")
+        here, known = self._place(event), len(self.mistakes)
+        self._files, self._anchors, self._mistakes_of = (*self._files, included.file), {}, {}
+        try:
+            self._events = iter(_events(included.text, included.file, self._left))
+            return self._document(path)
+        except ConfigError as error:
+            del self.mistakes[known:]
+            for each in error.problems:
+                place = Place(each.file, each.line or 1, each.column or 1)
+                self.mistakes.append((place, path, each.message))
+            return None, _Spot(here, kind=_Kind.SCALAR)
+        finally:
+            self._files, self._events, self._anchors, self._mistakes_of = outside
+
     def _list(self, start: YamlEvent, path: KeyPath) -> tuple[Any, _Spot]:
-        spot = _Spot(_place(start), kind=_Kind.LIST)
+        spot = _Spot(self._place(start), kind=_Kind.LIST)
         data: list[Any] = []
         for event in self._until_end():
             value, child = self._value(event, (*path, len(data)))
-            spot.children[len(data)] = (_place(event), child)
+            spot.children[len(data)] = (self._place(event), child)
             spot.values += child.values
             data.append(value)
         return data, spot
 
     def _mapping(self, start: YamlEvent, path: KeyPath) -> tuple[Any, _Spot]:
-        spot = _Spot(_place(start))
+        spot = _Spot(self._place(start))
         data: dict[Key, Any] = {}
         merged: list[tuple[YamlEvent, Any, _Spot]] = []
         for event in self._until_end():
@@ -342,7 +387,7 @@ class _Reader:
                 del self.mistakes[known:]
                 continue
             data[key] = value
-            spot.children[key] = (_place(event), child)
+            spot.children[key] = (self._place(event), child)
             spot.values += child.values
         for event, value, child in reversed(merged):
             if isinstance(value, dict | list):
@@ -384,10 +429,13 @@ class _Reader:
 
     def _refused(self, event: YamlEvent, path: KeyPath, message: str) -> tuple[None, _Spot]:
         self._add(event, path, message)
-        return None, _Spot(_place(event), kind=_Kind.SCALAR)
+        return None, _Spot(self._place(event), kind=_Kind.SCALAR)
 
     def _add(self, event: YamlEvent, path: KeyPath, message: str) -> None:
-        self.mistakes.append((_place(event), path, message))
+        self.mistakes.append((self._place(event), path, message))
+
+    def _place(self, event: YamlEvent) -> Place:
+        return Place(self._files[-1], event[1], event[2])
 
 
 def scalar(text: str, kind: str = "") -> str | int | float | bool | None:
@@ -408,8 +456,3 @@ def scalar(text: str, kind: str = "") -> str | int | float | bool | None:
     if special := _SPECIAL.fullmatch(text):
         return float(text.replace(".", "")) if special["inf"] else float("nan")
     return text
-
-
-def _place(event: YamlEvent) -> Place:
-    _, line, column, *_ = event
-    return Place(line, column)

@@ -5,6 +5,8 @@ A hub becomes one device for each unit id that its entities name.
 
 from __future__ import annotations
 
+import os
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -59,6 +61,12 @@ _ENTITY_REASONS = {
 _MAX_DEPTH = 3
 """How deep the section can be in a file: as in `homeassistant: packages: NAME: modbus`."""
 
+_MAX_INCLUDES = 300
+"""Maximum number of files that are read because others name them, each time counted."""
+
+_PACKAGES = re.compile(r"homeassistant(\.packages(\.[^.]*)?)?")
+"""The keys of packages: of a value that could not be read, nobody knows whether it has hubs."""
+
 
 def read_home_assistant(path: Path | str) -> Imported:
     """Converts the `modbus` section of a configuration, or a file that contains only that.
@@ -70,7 +78,9 @@ def read_home_assistant(path: Path | str) -> Imported:
     desk.quoted_numbers = desk.folds = True
     roots = list(_sections((), desk.document.data))
     if roots:
-        source.narrow(roots)
+        for each in source.narrow(roots):
+            if _PACKAGES.fullmatch(each.key):
+                desk.left_out_for(each)
     entries: list[tuple[KeyPath, Any]] = []
     for root in roots or [()]:
         hubs = desk.report.raw(root)
@@ -101,33 +111,67 @@ def _sections(path: KeyPath, data: Any) -> Iterator[KeyPath]:
 
 
 class _Tags:
-    """Gives tags of the source a value: `!secret`, from the file beside it."""
+    """Gives tags of the source a value: `!secret`, and `!include` of a file below its folder."""
 
     def __init__(self, folder: Path) -> None:
-        self._file = folder / "secrets.yaml"
-        self._secrets: dict[Any, Any] | None = None
+        self._folder = _real(folder)
+        self._secrets: dict[Path, dict[Any, Any]] = {}
+        self._includes_left = _MAX_INCLUDES
 
-    def resolve(self, kind: str, text: str) -> Any:
-        if kind != "!secret":
-            raise ValueError(f"found {kind} {text}, allowed: what is in that file")
-        if self._secrets is None:
-            self._secrets = self._read()
-        found = self._secrets.get(text)
+    def resolve(self, kind: str, text: str, file: str) -> Any:
+        if kind == "!include":
+            return self._included(text, Path(file).parent)
+        if kind == "!secret":
+            return self._secret(text, _real(Path(file).parent))
+        allowed = "what it stands for"
+        if kind.startswith("!include_dir_"):
+            allowed = "!include of each file; a file with hubs can be imported by itself"
+        raise ValueError(f"found {kind} {text}, allowed: {allowed}")
+
+    def _included(self, text: str, folder: Path) -> yaml_document.Included:
+        path = folder / text
+        self._includes_left -= 1
+        if self._includes_left < 0:
+            raise ValueError(
+                f"found !include {text}, allowed: {_MAX_INCLUDES} of them in all files"
+            )
+        if not _real(path).is_relative_to(self._folder):
+            allowed = "a file in the folder of the imported one, or below it"
+            raise ValueError(f"found !include {text}, allowed: {allowed}")
+        try:
+            content = yaml_document.read_text(path, str(path))
+        except ConfigError as error:
+            raise ValueError(f"found !include {text}, but {error}") from None
+        return yaml_document.Included(str(path), content)
+
+    def _secret(self, name: str, folder: Path) -> Any:
+        """The value in the nearest file with secrets, from the folder up, as in the source."""
+        for each in (folder, *folder.parents):
+            if each not in self._secrets:
+                self._secrets[each] = _secrets(each / "secrets.yaml")
+            found = self._secrets[each].get(name)
+            if found is not None or each == self._folder:
+                break
         if found is None or isinstance(found, dict | list):
-            missing = f"which is not in {self._file.name} beside this file"
-            raise ValueError(f"found the secret {text}, {missing}, allowed: its value")
+            missing = "which is not in secrets.yaml beside the imported file"
+            raise ValueError(f"found the secret {name}, {missing}, allowed: its value")
         return Secret(found) if isinstance(found, str) else found
 
-    def _read(self) -> dict[Any, Any]:
-        if not self._file.exists():
-            return {}
-        name = str(self._file)
-        try:
-            text = yaml_document.read_text(self._file, name)
-            data = yaml_document.parse(text, name, merges=True)[0].data
-        except ConfigError:
-            raise ValueError(f"found a secret, but {name} is not YAML that can be read") from None
-        return data if isinstance(data, dict) else {}
+
+def _real(path: Path) -> Path:
+    """The path without links: only what is in the folder is read."""
+    return Path(os.path.realpath(path))
+
+
+def _secrets(file: Path) -> dict[Any, Any]:
+    if not file.exists():
+        return {}
+    name = str(file)
+    try:
+        data = yaml_document.parse(yaml_document.read_text(file, name), name, merges=True)[0].data
+    except ConfigError:
+        raise ValueError(f"found a secret, but {name} is not YAML that can be read") from None
+    return data if isinstance(data, dict) else {}
 
 
 def _config(devices: dict[str, dict[str, Any]]) -> dict[str, Any]:

@@ -32,13 +32,13 @@ def note_write_actions(
     of_units: dict[tuple[str, int], str],
     devices: dict[str, dict[str, Any]],
 ) -> None:
-    """Notes the actions in this file that write, with what replaces them.
+    """Notes the actions in the file that write, with what replaces them.
 
     `of_units` has the name of the device of each hub and unit id.
     """
     stops = f"{either(_WRITES)} in automations and scripts stops, also in other files"
     desk.check(section, f"{stops}: publish to set topics instead, with writes: true in the output")
-    places: dict[str, list[KeyPath]] = {}
+    places: dict[tuple[str, str], list[KeyPath]] = {}
     for path, action, data in _writes((), desk.document.data):
         hub, unit = data.get("hub", "modbus_hub"), data.get("slave", data.get("unit", 1))
         address = data.get("address")
@@ -52,8 +52,9 @@ def note_write_actions(
                 break
         target = f"address {show(address)} of unit {show(unit)} of hub {show(hub)}"
         message = f"{action} to {target} stops when modbus is removed: {instead}"
-        places.setdefault(message, []).append(path)
-    for message, paths in places.items():
+        file = desk.document.place(path, of_key=True).file
+        places.setdefault((message, file), []).append(path)
+    for (message, _), paths in places.items():
         lines = dict.fromkeys(desk.document.place(path, of_key=True).line for path in paths)
         more = f" (lines {all_of(lines)})" if len(lines) > 1 else ""
         desk.check(paths[0], f"{message}{more}")
