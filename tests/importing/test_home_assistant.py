@@ -710,6 +710,20 @@ def test_packages_that_are_not_read_are_noted(imported: Callable[..., Imported])
     ]
 
 
+def test_entities_of_the_former_form_are_named(imported: Callable[..., Imported]) -> None:
+    former = "binary_sensor:\n  - platform: modbus\n    registers: [{hub: h, register: 1}]\n"
+    message = (
+        "found platform: modbus, the form before Home Assistant 2021.7, allowed: entities in lists "
+        "of their hub in modbus, such as sensors and switches, with address in place of register"
+    )
+    for hub, line in (("", 2), (HUB.replace("{entities}", ""), 10)):
+        with pytest.raises(NotImportable) as raised:
+            imported("", hub + former)
+        assert refusals(raised.value) == [f"{line}: binary_sensor[0]: {message}"]
+    found = imported("sensors: [{name: a, address: 1}]", HUB + former)
+    assert f"10: binary_sensor[0]: left out: {message}" in notes(found)
+
+
 def test_all_sections_are_read(imported: Callable[..., Imported]) -> None:
     rest = "type: tcp, host: 10.0.0.1, port: 502, sensors: [{name: a, address: 1}]"
     packages = [f"{name}:\n  modbus: [{{name: {name}, {rest}}}]\n" for name in "xy"]

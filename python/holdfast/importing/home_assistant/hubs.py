@@ -67,6 +67,11 @@ _MAX_INCLUDES = 300
 _PACKAGES = re.compile(r"homeassistant(\.packages(\.[^.]*)?)?")
 """The keys of packages: of a value that could not be read, nobody knows whether it has hubs."""
 
+_FORMER = (
+    "found platform: modbus, the form before Home Assistant 2021.7, allowed: entities in lists of "
+    "their hub in modbus, such as sensors and switches, with address in place of register"
+)
+
 
 def read_home_assistant(path: Path | str) -> Imported:
     """Converts the `modbus` section of a configuration, or a file that contains only that.
@@ -77,12 +82,13 @@ def read_home_assistant(path: Path | str) -> Imported:
     desk = source.desk
     desk.quoted_numbers = desk.folds = True
     roots = list(_sections((), desk.document.data))
+    former = list(_former((), desk.document.data))
     if roots:
         for each in source.narrow(roots):
             if _PACKAGES.fullmatch(each.key):
                 desk.left_out_for(each)
     entries: list[tuple[KeyPath, Any]] = []
-    for root in roots or [()]:
+    for root in roots or ([] if former else [()]):
         hubs = desk.report.raw(root)
         if isinstance(hubs, list):
             entries += [((*root, index), hub) for index, hub in enumerate(hubs)]
@@ -93,6 +99,8 @@ def read_home_assistant(path: Path | str) -> Imported:
             desk.problem(root, f"found {found}, allowed: the hubs of modbus")
     found_hubs = [section(desk, path, hub) for path, hub in entries]
     devices = _devices(desk, [hub for hub in found_hubs if hub is not None])
+    for entry in former:
+        (desk.left_out if devices else desk.problem)(entry, _FORMER)
     if not devices and not desk.report.problems and not source.problems:
         desk.problem((roots or [()])[0], "no hub has an entity that can be converted")
     source.finish()
@@ -108,6 +116,16 @@ def _sections(path: KeyPath, data: Any) -> Iterator[KeyPath]:
             yield (*path, key)
         else:
             yield from _sections((*path, key), value)
+
+
+def _former(path: KeyPath, data: Any) -> Iterator[KeyPath]:
+    """The paths of all entries of the form before the section had the entities."""
+    if isinstance(data, dict) and data.get("platform") == "modbus":
+        yield path
+    elif isinstance(data, dict | list) and len(path) <= _MAX_DEPTH + 1:
+        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
+            if key != "modbus":
+                yield from _former((*path, key), value)
 
 
 class _Tags:
