@@ -398,6 +398,119 @@ def test_a_file_that_can_not_be_read_any_more_is_left_under_another_name(
     assert drained(buffer) == [3, 4]
 
 
+def without_constraints(stored: Stored) -> None:
+    """A damaged row may have anything in any column."""
+    stored._db.executescript(
+        "ALTER TABLE readings RENAME TO sound;"
+        "CREATE TABLE readings (id INTEGER PRIMARY KEY, count, data);"
+        "INSERT INTO readings SELECT * FROM sound"
+    )
+
+
+WRONG_COLUMNS = [
+    "count = NULL",
+    "count = 'three'",
+    "count = 3.5",
+    "count = 0",
+    "count = -3",
+    "count = 9223372036854775807",
+    "data = NULL",
+]
+
+
+@pytest.mark.parametrize("change", WRONG_COLUMNS)
+def test_a_file_with_a_row_that_can_not_be_counted_is_sent_up_to_there(
+    opened: Opened, tmp_path: Path, change: str
+) -> None:
+    file = tmp_path / "b.db"
+    stored = opened(file)
+    for start in range(0, 9, 3):
+        stored.add([numbered(3, start)])
+    without_constraints(stored)
+    stored._db.execute(f"UPDATE readings SET {change} WHERE id = 2")
+    stored.close()
+    buffer = Buffer()
+    buffer.stored = opened(file)
+    assert numbers(buffer.take(9, 0)) == [0, 1, 2]
+    buffer.done()
+    with pytest.raises(FileGone, match=r"b\.db: row 2 has .* it is .*b\.db\.damaged now"):
+        buffer.take(9, 0)
+    assert (buffer.dropped, len(buffer)) == (3, 0)
+    assert [each.name for each in tmp_path.iterdir()] == ["b.db.damaged"]
+
+
+@pytest.mark.parametrize("change", WRONG_COLUMNS)
+def test_a_row_that_can_not_be_counted_does_not_keep_others_from_being_stored(
+    opened: Opened, tmp_path: Path, change: str
+) -> None:
+    """It would be the next to go from a full file."""
+    buffer = Buffer()
+    stored = buffer.stored = opened(tmp_path / "b.db", max_bytes=150)
+    stored.add([numbered(4)])
+    without_constraints(stored)
+    stored._db.execute(f"UPDATE readings SET {change}")
+    buffer.offer(polls(4, 4))
+    with pytest.raises(FileGone, match="row 1 has"):
+        buffer.keep(60)
+    assert buffer.dropped == 4
+    assert drained(buffer) == [4, 5, 6, 7]
+
+
+def test_rows_that_are_missing_end_the_use_of_a_file(opened: Opened, tmp_path: Path) -> None:
+    """Nothing waits for them without end."""
+    buffer = Buffer()
+    for use in (lambda: buffer.take(9, 0), lambda: buffer.keep(60)):
+        stored = buffer.stored = opened(tmp_path / "b.db", max_bytes=150)
+        stored.add([numbered(4)])
+        stored._db.execute("DELETE FROM readings")
+        buffer.offer(polls(4, 4))
+        with pytest.raises(FileGone, match="4 readings are missing"):
+            use()
+        assert buffer.dropped == 4
+        assert drained(buffer) == [4, 5, 6, 7]
+        buffer.dropped = 0
+
+
+def test_rows_in_a_wrong_order_are_not_sent_again(opened: Opened, tmp_path: Path) -> None:
+    """SQLite returns the rows behind another one in the order of the file, whatever their ids."""
+    file = tmp_path / "b.db"
+    stored = opened(file)
+    for start in range(0, 9, 3):
+        stored.add([numbered(3, start)])
+    [data] = stored._db.execute("SELECT data FROM readings WHERE id = 3").fetchone()
+    stored.close()
+    content = bytearray(file.read_bytes())
+    # Between an id and its data are the 5 bytes of a header and the count.
+    at = content.index(data) - 7
+    assert content[at] == 3
+    content[at] = 1
+    file.write_bytes(content)
+    buffer = Buffer()
+    stored = buffer.stored = opened(file)
+    refuse_removals(stored)
+    for sent in ([0, 1, 2], [3, 4, 5]):
+        assert numbers(buffer.take(3, 0)) == sent
+        with pytest.raises(OSError, match="is full"):
+            buffer.done()
+    with pytest.raises(FileGone, match="row 1 is behind row 2"):
+        buffer.take(3, 0)
+    assert buffer.dropped == 3
+
+
+def test_a_file_is_free_again_after_any_error(
+    opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: Stored) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Stored, "_recount", fail)
+        with pytest.raises(MemoryError) as error:
+            opened(tmp_path / "b.db")
+    assert opened(tmp_path / "b.db").count == 0
+    assert error.tb is not None
+
+
 @pytest.mark.parametrize("error", [OSError, RuntimeError])
 def test_what_can_not_be_stored_stays_in_memory(
     opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
@@ -594,7 +707,9 @@ def test_a_batch_that_the_file_has_dropped_takes_no_other_with_it(
     assert drained(buffer) == list(range(12))
 
 
-@pytest.mark.parametrize("data", [b"\xc1\xff", b"\x93\x01\x02\x03", b"\x91\x91\x01", b"\x01"])
+@pytest.mark.parametrize(
+    "data", [b"\xc1\xff\xff", b"\x93\x01\x02\x03", b"\x91\x91\x01", b"\xcd\0\1"]
+)
 def test_a_row_that_can_not_be_read_is_dropped_and_counted(
     opened: Opened, tmp_path: Path, data: bytes
 ) -> None:

@@ -19,7 +19,7 @@ from holdfast.polling import Reading
 from holdfast.tags import Tag
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     FindTag = Callable[[str, str], Tag | None]
@@ -40,6 +40,12 @@ CREATE TABLE IF NOT EXISTS tags (meaning INTEGER PRIMARY KEY, description TEXT N
 
 _DIGITS = 1
 """The type of msgpack's extension for integers as text."""
+
+
+class _Damage(sqlite3.DatabaseError):
+    """Damage that SQLite does not notice: it checks what it stores, not what it reads."""
+
+    sqlite_errorcode = sqlite3.SQLITE_CORRUPT
 
 
 class Stored:
@@ -148,7 +154,10 @@ class Stored:
             self._db.executemany("INSERT OR IGNORE INTO tags VALUES (?, ?)", new.items())
             for count, data in zip(map(len, rows), encoded, strict=True):
                 while self._bytes + len(data) > self._max_bytes and self.count:
-                    dropped += self._remove("id = (SELECT min(id) FROM readings)")
+                    removed = self._remove("id = (SELECT min(id) FROM readings)")
+                    if not removed:
+                        raise _missing(self.count)
+                    dropped += removed
                 if len(data) > self._max_bytes:
                     dropped += count
                     continue
@@ -165,18 +174,22 @@ class Stored:
         Removes those that can't be decoded, and counts them in `damaged`. If the file itself can't
         be read, it is `FileGone`: trying again would hold up all that comes behind.
         """
-        query = "SELECT id, data, count FROM readings WHERE id > ? ORDER BY id LIMIT 1"
+        query = (
+            "SELECT id, count, length(data), data FROM readings WHERE id > ? ORDER BY id LIMIT 1"
+        )
         found: list[Reading] = []
         last = self._sent
         self._first = {}
         while True:
             try:
-                row = self._db.execute(query, (last,)).fetchone()
-                if row is None and not found:
-                    self._recount()
-                if row is None or (found and len(found) + row[2] > most):
+                row = next(_sound(self._db.execute(query, (last,)).fetchall()), None)
+                if row is None and not found and self.count:
+                    raise _missing(self.count)
+                if row is None or (found and len(found) + row[1] > most):
                     return found
-                id, data, count = row
+                id, count, _, data = row
+                if id <= last:
+                    raise _Damage(f"row {id} is behind row {last}")
                 readings = [self._reading(*plain) for plain in _decoded(data)]
             except sqlite3.Error as error:
                 if found:
@@ -231,7 +244,7 @@ class Stored:
             f"DELETE FROM readings WHERE {which} RETURNING id, count, length(data)", parameters
         ).fetchall()
         removed = 0
-        for id, count, size in rows:
+        for id, count, size in _sound(rows):
             self._bytes -= size
             if id > self._sent:
                 removed += count
@@ -240,27 +253,20 @@ class Stored:
         return removed
 
     def _recount(self) -> None:
-        query = (
-            "SELECT coalesce(sum(count) FILTER (WHERE id > ?), 0), coalesce(sum(length(data)), 0) "
-            "FROM readings"
-        )
-        try:
-            self.count, self._bytes = self._db.execute(query, (self._sent,)).fetchone()
-        except sqlite3.Error:
-            # What is before the damage can be sent; what is behind it counts as lost later.
-            count = size = last = 0
-            for order in ("ASC", "DESC"):
-                rows = (
-                    f"SELECT id, count, length(data) FROM readings WHERE id > ? ORDER BY id {order}"
-                )
-                with contextlib.suppress(sqlite3.Error):
-                    for id, waiting, length in self._db.execute(rows, (last,)):
-                        last = id
-                        count += waiting if id > self._sent else 0
-                        size += length
-            if not count:
-                raise
-            self.count, self._bytes = count, size
+        self.count = self._bytes = last = 0
+        damage = None
+        # What is before damage can be sent; what is behind it counts as lost later.
+        for order in ("ASC", "DESC"):
+            query = f"SELECT id, count, length(data) FROM readings WHERE id > ? ORDER BY id {order}"
+            try:
+                with contextlib.closing(self._db.execute(query, (last,))) as rows:
+                    for last, count, size in _sound(rows):
+                        self.count += count if last > self._sent else 0
+                        self._bytes += size
+            except sqlite3.Error as error:
+                damage = error
+        if damage is not None and not self.count:
+            raise damage
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
@@ -324,6 +330,20 @@ class Stored:
         return self._earlier.setdefault((name, meaning), tag_from(name, row[0]))
 
 
+def _missing(count: int) -> _Damage:
+    return _Damage(f"{count} readings are missing")
+
+
+def _sound(rows: Iterable[Any]) -> Iterator[Any]:
+    """Rows that begin with an id, how many readings there are, and their size."""
+    for row in rows:
+        id, count, size, *_ = row
+        # Each reading takes several bytes.
+        if not (type(count) is type(size) is int and 0 < count <= size):
+            raise _Damage(f"row {id} has {count} readings in {size} bytes")
+        yield row
+
+
 def _encoded(plain: Sequence[tuple[Any, ...]]) -> bytes:
     try:
         return msgspec.msgpack.encode(plain)
@@ -347,13 +367,15 @@ def _decoded(data: bytes) -> Any:
 
 @contextlib.contextmanager
 def file_errors(file: Path, undo: Callable[[], object] = lambda: None) -> Iterator[None]:
-    """Raises `OSError` for errors of SQLite, after `undo`, whose own errors do not count."""
+    """Raises `OSError` for errors of SQLite. After any, `undo`, whose own errors do not count."""
     try:
         yield
-    except sqlite3.Error as error:
+    except BaseException as error:
         with contextlib.suppress(sqlite3.Error):
             undo()
-        raise OSError(f"{file}: {error}") from error
+        if isinstance(error, sqlite3.Error):
+            raise OSError(f"{file}: {error}") from error
+        raise
 
 
 def is_in_place(file: Path, status: os.stat_result) -> bool:
