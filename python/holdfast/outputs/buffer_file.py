@@ -10,11 +10,12 @@ import contextlib
 import os
 import sqlite3
 from typing import TYPE_CHECKING, Any
+from zlib import crc32
 
 import msgspec
 
 from holdfast.outputs.buffer_file_error import FileGone
-from holdfast.outputs.tag_meaning import described, meaning_of, tag_from
+from holdfast.outputs.tag_meaning import described, tag_from
 from holdfast.polling import Reading
 from holdfast.tags import Tag
 
@@ -24,19 +25,25 @@ if TYPE_CHECKING:
 
     FindTag = Callable[[str, str], Tag | None]
 
-FORMAT = 0
-"""The version of the format, in each file. Files of a later one are not touched."""
+FORMAT = 1
+"""The version of the format, in each file. Files of another one are not touched."""
 
 LOCK_TIMEOUT_S = 1.0
 """Seconds to wait for a file that is in use, by default."""
 
-_CREATE = """
-CREATE TABLE IF NOT EXISTS readings (
-    id INTEGER PRIMARY KEY AUTOINCREMENT, count INTEGER NOT NULL, data BLOB NOT NULL
+_CREATE = f"""
+BEGIN;
+CREATE TABLE readings (
+    id INTEGER PRIMARY KEY AUTOINCREMENT,
+    count INTEGER NOT NULL, data BLOB NOT NULL, checksum INTEGER NOT NULL
 );
-CREATE TABLE IF NOT EXISTS tags (meaning INTEGER PRIMARY KEY, description TEXT NOT NULL)
+CREATE TABLE tags (meaning INTEGER PRIMARY KEY, description TEXT NOT NULL);
+PRAGMA user_version={FORMAT};
+COMMIT
 """
-"""`tags` is for readings whose tag is changed or removed before they are sent."""
+"""`checksum` is the CRC of `data`, begun with `count`. `tags` is for readings whose tag is changed
+or removed before they are sent: `meaning` is the CRC of the description.
+"""
 
 _DIGITS = 1
 """The type of msgpack's extension for integers as text."""
@@ -89,12 +96,14 @@ class Stored:
             # Two processes with one file would each send the readings of the other.
             self._db.execute("PRAGMA locking_mode=EXCLUSIVE")
             [found] = self._db.execute("PRAGMA user_version").fetchone()
-            if found > FORMAT:
+            [tables] = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()
+            if tables and found != FORMAT:
                 raise sqlite3.NotSupportedError(
-                    f"format {found}, of a later version of Holdfast, allowed: {FORMAT}"
+                    f"format {found}, of another version of Holdfast or program, allowed: {FORMAT}"
                 )
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
-            self._db.executescript(_CREATE)
+            if not tables:
+                self._db.executescript(_CREATE)
             self._recount()
             self._status = self.file.stat()
 
@@ -134,11 +143,10 @@ class Stored:
         dropped = 0
         # Once for each tag: most readings share theirs.
         tags = {id(reading.tag): reading.tag for row in rows for reading in row}
-        meanings = {of: meaning_of(tag) for of, tag in tags.items()}
+        texts = {of: described(tag) for of, tag in tags.items()}
+        meanings = {of: crc32(text.encode()) for of, text in texts.items()}
         new = {
-            meanings[of]: described(tag)
-            for of, tag in tags.items()
-            if meanings[of] not in self._described
+            meanings[of]: text for of, text in texts.items() if meanings[of] not in self._described
         }
         encoded = [
             _encoded(
@@ -161,7 +169,10 @@ class Stored:
                 if len(data) > self._max_bytes:
                     dropped += count
                     continue
-                self._db.execute("INSERT INTO readings (count, data) VALUES (?, ?)", (count, data))
+                self._db.execute(
+                    "INSERT INTO readings (count, data, checksum) VALUES (?, ?, ?)",
+                    (count, data, crc32(data, count)),
+                )
                 self.count += count
                 self._bytes += len(data)
         self._described |= new.keys()
@@ -171,11 +182,12 @@ class Stored:
         """The oldest readings, in whole rows: one, and more up to `most` readings. Empty if there
         are none.
 
-        Removes those that can't be decoded, and counts them in `damaged`. If the file itself can't
-        be read, it is `FileGone`: trying again would hold up all that comes behind.
+        Removes those that are not as they were stored, and counts them in `damaged`. If the file
+        itself can't be read, it is `FileGone`: trying again would hold up all that comes behind.
         """
         query = (
-            "SELECT id, count, length(data), data FROM readings WHERE id > ? ORDER BY id LIMIT 1"
+            "SELECT id, count, length(data), data, checksum FROM readings "
+            "WHERE id > ? ORDER BY id LIMIT 1"
         )
         found: list[Reading] = []
         last = self._sent
@@ -187,9 +199,11 @@ class Stored:
                     raise _missing(self.count)
                 if row is None or (found and len(found) + row[1] > most):
                     return found
-                id, count, _, data = row
+                id, count, _, data, checksum = row
                 if id <= last:
                     raise _Damage(f"row {id} is behind row {last}")
+                if crc32(data, count) != checksum:
+                    raise ValueError("the row is not the one that was stored")
                 readings = [self._reading(*plain) for plain in _decoded(data)]
             except sqlite3.Error as error:
                 if found:
@@ -315,18 +329,18 @@ class Stored:
         meaning: int,
     ) -> Reading:
         tag = self._find(device, name)
-        if tag is None or meaning != meaning_of(tag):
-            tag = self._as_stored(name, meaning) or _stand_in(name, value)
+        if tag is None or meaning != crc32(described(tag).encode()):
+            tag = self._as_stored(name, meaning)
         return Reading(device, tag, value, time, fault, undecoded)
 
-    def _as_stored(self, name: str, meaning: int) -> Tag | None:
-        """A tag as it was. `None` in files of versions that did not store that."""
+    def _as_stored(self, name: str, meaning: int) -> Tag:
+        """A tag as it was. Raises `ValueError` if that is damaged."""
         if (known := self._earlier.get((name, meaning))) is not None:
             return known
         query = "SELECT description FROM tags WHERE meaning = ?"
         row = self._db.execute(query, (meaning,)).fetchone()
-        if row is None:
-            return None
+        if row is None or crc32(row[0]) != meaning:
+            raise ValueError("the description is not the one that was stored")
         return self._earlier.setdefault((name, meaning), tag_from(name, row[0]))
 
 
@@ -384,12 +398,3 @@ def is_in_place(file: Path, status: os.stat_result) -> bool:
         return os.path.samestat(file.stat(), status)
     except OSError:
         return False
-
-
-def _stand_in(name: str, value: Any) -> Tag:
-    """A tag for a value whose own tag was changed, or is not in the configuration any more."""
-    first = value[0] if isinstance(value, list) and value else value
-    if isinstance(first, bool):
-        return Tag(name, "coils", 0)
-    kind = "string:2" if isinstance(first, str) else "bytes:2"
-    return Tag(name, "input_registers", 0, kind if isinstance(first, str | bytes) else "float64")
