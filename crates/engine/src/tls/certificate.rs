@@ -275,11 +275,15 @@ impl Parsed {
 
     /// Whether an authority may have issued it. Its signature tells, unless it can't be verified with the key of
     /// that authority. Then every one of the name may, unless the certificate names another key, or another
-    /// `listed` one has signed it.
+    /// `listed` one has signed it. A self-signed one need not name its key (RFC 5280, 4.2.1.1).
     pub(super) fn may_be_of(&self, authority: &Parsed, listed: &[&Parsed]) -> bool {
         self.is_issued_by(authority)
             && self.has_signature_of(authority).unwrap_or_else(|| {
-                let keys = self.authority_key().zip(authority.own_key());
+                let named = self.authority_key();
+                if self.is_self_signed() && (named.is_none() || named == self.own_key()) {
+                    return self.key() == authority.key();
+                }
+                let keys = named.zip(authority.own_key());
                 keys.is_none_or(|(named, key)| named == key)
                     && !listed.iter().any(|each| self.is_signed_by(each))
             })

@@ -732,6 +732,23 @@ mod tests {
     }
 
     #[test]
+    fn a_root_is_not_below_a_revoked_authority_of_its_name() {
+        let [plant, root] = ["plant", "root"].map(|name| Owner::authority(name, None));
+        let cross = Owner::new("root", Some(&plant), |params| {
+            numbered(3)(params);
+            params.is_ca = rcgen::IsCa::Ca(rcgen::BasicConstraints::Unconstrained);
+        });
+        let leaf = Owner::new("leaf", Some(&root), numbered(4));
+        let lists = [version_1(&plant, &[&cross]), version_1(&root, &[])];
+        let with_root = |root: &[u8]| {
+            let listed = [plant.certificate.der(), root, cross.certificate.der()].to_vec();
+            judged_as_der(listed, &lists, vec![leaf.certificate.der()])
+        };
+        assert_eq!(with_root(root.certificate.der()), "");
+        assert_eq!(with_root(&with_unsupported_signature(&root)), "");
+    }
+
+    #[test]
     fn the_newest_list_of_every_authority_counts_that_may_have_issued_a_listed_certificate() {
         let [root, twin] = [0; 2].map(|_| Owner::authority("root", None));
         let reason = |names_key, lists: [&Vec<u8>; 2]| {
