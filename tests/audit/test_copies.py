@@ -36,6 +36,7 @@ MESSAGE = re.compile(
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(copies, "RETRY_DELAY_S", 0.01)
+    monkeypatch.setattr(copies, "BACK_AFTER_S", 0.0)
 
 
 @pytest.fixture
@@ -165,6 +166,23 @@ def test_lines_wait_for_a_receiver_that_is_down(
     await_counts(log, "syslog", sent=2, dropped=0, waiting=0)
     wire.until(lambda: "audit_copies_back" in caplog.messages, "it is logged")
     assert caplog.messages == ["audit_copy_failed", "audit_copies_back"]
+
+
+def test_nobody_who_listens_over_udp_is_logged_once(
+    udp: socket.socket,
+    audit: Callable[..., Audit],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(copies, "BACK_AFTER_S", 3600.0)
+    caplog.set_level("INFO")
+    address = udp.getsockname()
+    udp.connect(("127.0.0.1", 9))  # It takes nothing from others, and nobody else gets its port.
+    log = audit(Copies("syslog", Syslog("udp", address)))
+    log.write_all([{"number": number} for number in range(20)])
+    await_counts(log, "syslog", waiting=0)
+    assert counts(log, "syslog")["failed"] > 1
+    assert caplog.messages == ["audit_copy_failed"]
 
 
 def test_lines_that_find_no_room_are_dropped_counted_and_logged(

@@ -25,6 +25,10 @@ MAX_WAITING_BYTES = 32 * 2**20
 RETRY_DELAY_S = 1.0
 """Seconds before a line is sent again."""
 
+BACK_AFTER_S = 5.0
+"""Seconds without a failure before an outage is over: over UDP, sends to a port where nobody
+listens succeed and fail by turns."""
+
 LOST_INTERVAL_S = 60.0
 """Interval of logging that lines were dropped."""
 
@@ -55,7 +59,8 @@ class Copies:
         """The dropped lines that were logged, and when."""
         self._closing = False
         self._error: str | None = None
-        """Why the receiver has not got the line that waits."""
+        """Why the receiver is down."""
+        self._failed_at = -inf
         self._change = threading.Condition()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"holdfast-{name}", daemon=True)
@@ -129,9 +134,9 @@ class Copies:
             if too_long or str(error) != self._error:
                 log_lines.problem("audit_copy_failed", receiver=self.name)
             if not too_long:
-                self._error = str(error)
+                self._error, self._failed_at = str(error), time.monotonic()
                 self._closed.wait(RETRY_DELAY_S)
-        elif self._error is not None:
+        elif self._error is not None and time.monotonic() >= self._failed_at + BACK_AFTER_S:
             self._error = None
             log_lines.write(logging.INFO, "audit_copies_back", receiver=self.name)
         self._tell_lost(LOST_INTERVAL_S)
