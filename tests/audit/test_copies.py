@@ -216,7 +216,7 @@ def test_a_line_that_is_too_long_for_a_datagram_is_dropped(
     log.write(values=[65535] * 20_000)
     log.write(number=2)
     assert record(udp.recv(65536))["number"] == 2
-    await_counts(log, "syslog", sent=1, failed=1, dropped=1, waiting=0)
+    await_counts(log, "syslog", sent=1, failed=0, dropped=1, waiting=0)
     log.close()
     assert caplog.messages == ["audit_copy_failed"]
 

@@ -120,10 +120,13 @@ class Copies:
             return self._waiting[0] if self._waiting and not self._closed.is_set() else None
 
     def _note(self, error: OSError | None) -> None:
-        """Counts an attempt. A line that is too long will never be sent: it is dropped."""
+        """Counts an attempt.
+
+        A line that is too long will never be sent: it is dropped. The receiver may be up.
+        """
         too_long = error is not None and error.errno == errno.EMSGSIZE
         with self._change:
-            self._failed += error is not None
+            self._failed += error is not None and not too_long
             self._sent += error is None
             self._dropped += too_long
             self._told += too_long
