@@ -22,6 +22,7 @@ from support import wire
 from support.brokers import free_port
 from support.line_protocol import Point, parsed
 from support.readings import numbered, polls, reading, tag
+from support.secured import Authority, Relay, context
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -294,6 +295,28 @@ def test_a_receiver_without_values_shows_whether_it_can_be_reached(database: Dat
     nobody = influx(f"http://127.0.0.1:{free_port()}", bucket="b")
     with pytest.raises(ConnectionRefusedError):
         nobody.idle()
+
+
+@pytest.mark.parametrize("scheme", ["http", "https"])
+def test_a_receiver_without_values_shows_that_its_connection_has_ended(
+    database: Database, tmp_path: Path, scheme: str
+) -> None:
+    authority = Authority(tmp_path)
+    owner = authority.issue("db", "IP:127.0.0.1")
+    secure = {"tls": {"ca_file": str(authority.ca)}} if scheme == "https" else {}
+    to = ("127.0.0.1", database.server_port)
+    with Relay(to, context(owner) if secure else None) as relay:
+        output = influx(f"{scheme}://127.0.0.1:{relay.address[1]}", bucket="b", **secure)
+        assert output.idle()
+        output.send(numbered(1))
+        assert output.idle()
+        assert relay.connections == 1
+        relay.cut()
+        wire.until(lambda: output.idle() and relay.connections == 2, "it connects again")
+        output.send(numbered(1))
+        assert relay.connections == 2
+    with pytest.raises(ConnectionRefusedError):
+        wire.until(lambda: not output.idle(), "nobody listens")
 
 
 def test_a_receiver_that_is_no_http_server_is_an_error(fake_server: int) -> None:

@@ -9,6 +9,7 @@ import http.client
 import json
 import re
 import socket
+import ssl
 import threading
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
@@ -117,6 +118,8 @@ class Influx(Receiver):
 
     def idle(self) -> bool:
         """Connects: also without a value, it shows whether the receiver can be reached."""
+        if self._connection is not None and self._is_over(self._connection.sock):
+            self.close()
         if self._connection is None:
             self._connection = self._opened()
         return True
@@ -200,6 +203,19 @@ class Influx(Receiver):
         connection.connect()
         connection.sock.settimeout(self._settings.timeout)
         return connection
+
+    def _is_over(self, connection: socket.socket) -> bool:
+        """Whether the receiver has closed a connection, or sends what nobody has asked for."""
+        connection.settimeout(0)
+        try:
+            connection.recv(1)
+        except (BlockingIOError, ssl.SSLWantReadError):
+            return False
+        except OSError:
+            return True
+        finally:
+            connection.settimeout(self._settings.timeout)
+        return True
 
     def _created(self, timeout: float) -> http.client.HTTPConnection:
         host, port, secure, _ = self._target
