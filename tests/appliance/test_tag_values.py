@@ -204,6 +204,8 @@ def test_a_receiver_that_can_not_be_reached_delays_nothing_else(
 def test_line_protocol_has_no_readings_without_a_value(tmp_path: Path) -> None:
     """They do not count as sent, nor do they hide that nobody listens."""
     made = settings(0)
+    empty = {"area": "holding_registers", "address": 8, "type": "int16[2]", "null": [0]}
+    made["profiles"] = {"meter": {"tags": METER["tags"] | {"empty": empty}}}
     made["outputs"]["lines"] = {"type": "file", "file": "lines", "format": "influx"}
     made["outputs"]["down"] = {"type": "influx", "url": "http://127.0.0.1:9", "bucket": "b"}
     with Fake(lambda request: exception(request, 4)) as fake:
@@ -214,7 +216,7 @@ def test_line_protocol_has_no_readings_without_a_value(tmp_path: Path) -> None:
                 return appliance.diagnostics.adapter(f"output/{name}") or {}
 
             wire.until(lambda: status("down").get("connected") is False, "nobody listens")
-            wire.until(lambda: status("out")["readings"]["sent"] == 4, "the other has them")
+            wire.until(lambda: status("out")["readings"]["sent"] == 5, "the other has them")
             fake.answer = data
             wire.until(lambda: status("lines")["readings"]["sent"] == 4, "values are sent")
             wire.until(lambda: status("down")["waiting"] == 4, "values wait")

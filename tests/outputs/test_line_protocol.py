@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from holdfast.outputs.line_protocol import lines
+from holdfast.outputs.line_protocol import has_field, lines
 from holdfast.tags.scale import RegisterScale
 from support.line_protocol import parsed
 from support.readings import TIME, reading, tag
@@ -50,6 +50,13 @@ def test_the_values_of_one_time_share_a_line() -> None:
         f"modbus,device=pump,site=north a=2i {AT + 10**9}",
         f"modbus,device=fan,site=north a=3i {AT}",
     ]
+
+
+@pytest.mark.parametrize(
+    "value", [0, False, "", b"", 1e308, [None, 1], None, math.nan, -math.inf, [], [None, math.inf]]
+)
+def test_what_has_no_field_has_no_line(value: Any) -> None:
+    assert has_field(value) is bool(lines([reading(value)], "m", {}))
 
 
 def test_floats_have_their_digits_and_wide_integers_are_floats() -> None:

@@ -1,11 +1,12 @@
 """The line protocol of InfluxDB, which Telegraf, VictoriaMetrics and QuestDB read too.
 
-One line has the values that a device gave at one time, one field for each tag. Null is a missing
-field.
+One line has the values that a device gave at one time, one field for each tag. What `has_field`
+refuses is a missing field.
 """
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,13 @@ MIN_INTEGER, MAX_INTEGER = -(2**63), 2**63 - 1
 _NAME = str.maketrans({",": r"\,", " ": r"\ ", "\n": r"\n", "\r": r"\r"})
 _KEY = str.maketrans({",": r"\,", " ": r"\ ", "=": r"\=", "\n": r"\n", "\r": r"\r"})
 _TEXT = str.maketrans({'"': r"\"", "\\": "\\\\"})
+
+
+def has_field(value: Any) -> bool:
+    """Whether there is a field for a value, or for any item of an array."""
+    if isinstance(value, list):
+        return any(map(has_field, value))
+    return value is not None and not (isinstance(value, float) and not math.isfinite(value))
 
 
 def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]) -> bytes:
@@ -73,17 +81,16 @@ def _fields(name: str, value: Any) -> Iterable[tuple[str, str]]:
     if isinstance(value, list):
         for index, item in enumerate(value):
             yield from _fields(f"{name}[{index}]", item)
-    elif (written := _written(value)) is not None:
-        yield name, written
+    elif has_field(value):
+        yield name, _written(value)
 
 
-def _written(value: Any) -> str | None:
+def _written(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):
         return f"{value}i" if MIN_INTEGER <= value <= MAX_INTEGER else repr(float(value))
     if isinstance(value, float):
         return repr(value)
-    if isinstance(value, str):
-        return f'"{value.translate(_TEXT)}"'
-    return None
+    assert isinstance(value, str), "all others have another form, or no field"
+    return f'"{value.translate(_TEXT)}"'

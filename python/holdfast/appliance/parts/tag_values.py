@@ -21,6 +21,7 @@ from holdfast.config.models.devices import DeviceIdentityConfig
 from holdfast.events import log_lines
 from holdfast.outputs import Buffer, Changes, Sending
 from holdfast.outputs.device_access import DeviceInfo
+from holdfast.outputs.line_protocol import has_field
 from holdfast.polling import Reading
 from holdfast.polling.readings import Reader
 from holdfast.runtime.heartbeat import Heartbeat
@@ -94,7 +95,7 @@ class _Output:
             readings = self.changes.of(poll.readings)
             if self.settings.is_line_protocol:
                 # Nothing would be sent of them, but they would count as sent.
-                readings = [each for each in readings if each.value is not None]
+                readings = [each for each in readings if has_field(each.value)]
             offered.append(readings)
         self.buffer.offer(offered)
 
