@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import random
 import struct
 import time
@@ -286,6 +287,41 @@ def test_what_can_not_be_read_again_costs_nothing_else() -> None:
     }
     assert list(description.undescribed(found)) == [("holding_registers", range(17, 18))]
     assert sum(each.tag.count for each in found.tags) == 39
+
+
+@pytest.mark.parametrize(
+    ("busy", "unread", "values"),
+    [
+        ([0, 2, 4], [], (7, 7, 7)),
+        ([2, 3], [range(9)], (7, 7)),
+        ([1, 2], [range(9)], (7,)),
+        ([0, 1], [range(9)], None),
+    ],
+)
+def test_a_busy_device_is_asked_once_more_and_what_it_has_returned_is_kept(
+    busy: list[int], unread: list[range], values: tuple[int, ...] | None
+) -> None:
+    """A reading is one request, and one more if the device is busy."""
+    again = itertools.count()
+    is_searched = False
+
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 3 or first + count > 9:
+            return exception(pdu, 2)
+        return exception(pdu, 6) if is_searched and next(again) in busy else registers(pdu, 7)
+
+    def note(survey: Survey) -> None:
+        nonlocal is_searched
+        is_searched = survey.is_done
+
+    found = Description(1, Survey(["holding_registers"], span=range(12)))
+    found.survey.areas[0].largest = 9
+    with FakeDevice(answers) as device, holdfast.SyncClient(device.url) as client:
+        description.describe(found, client, reads=3, every=0, delay=0, progress=note)
+    description.conclude(found)
+    assert [each for ranges in found.unread.values() for each in ranges] == unread
+    assert {each.values for each in found.tags} == ({values} if values else set())
 
 
 def test_unused_registers_of_a_device_of_whole_values_are_whole_values() -> None:

@@ -705,12 +705,13 @@ def read_in_parts(
     read: Callable[[Area, int, str], list[int]], block: Probe, width: int
 ) -> Iterator[tuple[Probe, list[int] | ModbusException]]:
     """Reads a block that exists; halves what the device refuses, because it may take less at once.
+    Repeats a read once if the device was busy.
 
     Yields each part with its content, or with the exception of what can't be halved: an exception
     other than 02 and 03, or `width` addresses.
     """
     try:
-        content = read(block.area, block.address, _kind(block))
+        content = _read_or_repeat(read, block)
     except ModbusException as error:
         half = block.count // 2 // width * width
         if error.code not in REFUSALS or not half:
@@ -721,6 +722,15 @@ def read_in_parts(
         yield from read_in_parts(read, Probe(area, middle, block.count - half), width)
     else:
         yield block, content
+
+
+def _read_or_repeat(read: Callable[[Area, int, str], list[int]], block: Probe) -> list[int]:
+    try:
+        return read(block.area, block.address, _kind(block))
+    except ModbusException as error:
+        if error.code != BUSY:
+            raise
+    return read(block.area, block.address, _kind(block))
 
 
 def _kind(probe: Probe) -> str:

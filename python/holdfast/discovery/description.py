@@ -156,13 +156,16 @@ def _read_again(
     parts = []
     for probe, content in answers:
         part = range(probe.address, probe.address + probe.count)
+        known = slice(part.start - block.start, part.stop - block.start)
+        contents = [old[known] for old in before]
         if isinstance(content, ModbusException):
             ranges = found.unread.setdefault((area, str(content)), [])
             address_search.add_addresses(ranges, part.start, len(part))
-            continue
-        known = slice(part.start - block.start, part.stop - block.start)
-        found.reads[area, part] = [*(old[known] for old in before), content]
-        parts.append(part)
+        else:
+            contents.append(content)
+            parts.append(part)
+        if contents:
+            found.reads[area, part] = contents
     return parts
 
 
