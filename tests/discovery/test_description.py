@@ -289,6 +289,37 @@ def test_what_can_not_be_read_again_costs_nothing_else() -> None:
     assert sum(each.tag.count for each in found.tags) == 39
 
 
+def test_texts_and_arrays_are_what_the_device_takes_at_once() -> None:
+    text = "Pump station 7, river bank west, dr"
+    content = [
+        *values.encode(text, "string:38"),
+        *values.encode(230.1, "float32"),
+        *[0xFFFF] * 6,
+        *values.encode(231.2, "float32"),
+    ]
+
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 3 or first + count > len(content):
+            return exception(pdu, 2)
+        if count > 5:
+            return exception(pdu, 3)
+        return bytes([3, 2 * count]) + struct.pack(f">{count}H", *content[first : first + count])
+
+    found = Description(1, Survey(["holding_registers"], span=range(40)))
+    with FakeDevice(answers) as device, holdfast.SyncClient(device.url) as client:
+        description.describe(found, client, reads=2, every=0, delay=0)
+        description.conclude(found)
+        assert list(description.undescribed(found)) == []
+        assert not overlaps(found.tags)
+        for reading in TagReader([each.tag for each in found.tags]).read(client):
+            assert reading.error is None
+    texts = [each for each in found.tags if each.tag.type.startswith("string")]
+    assert len(texts) > 4
+    assert all(each.tag.count <= 5 for each in found.tags)
+    assert "".join(str(each.values[-1]) for each in texts).split() == text.split()
+
+
 @pytest.mark.parametrize(
     ("busy", "unread", "values"),
     [

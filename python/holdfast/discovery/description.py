@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+from holdfast import values
 from holdfast.discovery import (
     address_search,
     byte_order_habits,
@@ -41,7 +42,6 @@ SINGLE_BITS = 64
 """Ranges of more bits become tags of many bits each."""
 
 MAX_BITS_PER_TAG = 256
-MAX_REGISTERS_PER_TAG = READ_LIMITS["holding_registers"]
 
 MIN_GAP_REGISTERS = 8
 """So many registers that contain nothing separate the values before them from those behind."""
@@ -218,7 +218,7 @@ def conclude(found: Description, now: float | None = None, seconds: float | None
         found.tags += sunspec_tags.tags_of(found.sunspec)
     for whole in _joined(found):
         if whole.area in BIT_AREAS:
-            found.tags += _bits(whole, found.survey.areas[areas.index(whole.area)].limit)
+            found.tags += _bits(whole)
     try:
         pieces = list(_pieces(found))
         habits = _habits(pieces, now)
@@ -245,6 +245,8 @@ class _Piece:
     area: Area
     address: int
     reads: list[list[int]]
+    limit: int
+    """The most addresses that one request may be for."""
     is_empty: bool
 
     @property
@@ -261,6 +263,7 @@ class _Piece:
 def _joined(found: Description) -> Iterator[_Piece]:
     """What was read, in ranges as long as possible, with the reads that are of a whole range."""
     areas = [each.area for each in found.survey.areas]
+    limits = {each.area: each.limit for each in found.survey.areas}
     piece: _Piece | None = None
     for area, block in sorted(found.reads, key=lambda key: (areas.index(key[0]), key[1].start)):
         contents = found.reads[area, block]
@@ -271,7 +274,8 @@ def _joined(found: Description) -> Iterator[_Piece]:
             continue
         if piece is not None:
             yield piece
-        piece = _Piece(area, block.start, [[*read] for read in contents], is_empty=False)
+        reads = [[*read] for read in contents]
+        piece = _Piece(area, block.start, reads, limits[area], is_empty=False)
     if piece is not None:
         yield piece
 
@@ -358,17 +362,34 @@ def _values(
     division = segments.divide(piece.reads, now=now, habits=habits, is_open=False)
     for value, chance in division.best:
         sure = segments.confidence(chance, value.kind)
-        if not any(value.found) or value.reasons == (segments.FILL_REASONS[0xFFFF],):
-            sure = min(sure, segments.NOTHING_KNOWN)
-        yield _described(piece, value, min(sure, MAX_CONFIDENCE))
+        for part in _parts(piece, value):
+            known = sure
+            if not any(part.found) or part.reasons == (segments.FILL_REASONS[0xFFFF],):
+                known = min(sure, segments.NOTHING_KNOWN)
+            yield _described(piece, part, min(known, MAX_CONFIDENCE))
+
+
+def _parts(piece: _Piece, value: Value) -> Iterator[Value]:
+    """A value, in parts that the device returns in one request. Only texts and arrays have any."""
+    is_text = value.kind == "string"
+    if value.registers <= piece.limit or not (is_text or SIZES[value.kind] == 1):
+        yield value
+        return
+    for first in range(value.offset, value.stop, piece.limit):
+        count = min(piece.limit, value.stop - first)
+        kind = f"string:{2 * count}" if is_text else value.type
+        # An array is shown by its first element.
+        parts = [read[first : first + (count if is_text else 1)] for read in piece.reads]
+        found = tuple(values.decode(part, kind, value.order) for part in parts)
+        yield replace(value, type=kind, offset=first, registers=count, found=found)
 
 
 def _filled(piece: _Piece) -> Iterator[DescribedTag]:
     """Registers that contain nothing, in tags of limited size."""
     content = piece.reads[0][0]
     size = len(piece.reads[0])
-    for first in range(0, size, MAX_REGISTERS_PER_TAG):
-        count = min(MAX_REGISTERS_PER_TAG, size - first)
+    for first in range(0, size, piece.limit):
+        count = min(piece.limit, size - first)
         reasons = (segments.FILL_REASONS[content],)
         kind = "uint16" if count == 1 else f"uint16[{count}]"
         tag = _tag(piece.area, piece.address + first, kind, "ABCD", segments.NOTHING_KNOWN, reasons)
@@ -390,9 +411,9 @@ def _described(piece: _Piece, value: Value, confidence: float) -> DescribedTag:
     return DescribedTag(tag, confidence, value.found, reasons)
 
 
-def _bits(piece: _Piece, limit: int) -> Iterator[DescribedTag]:
+def _bits(piece: _Piece) -> Iterator[DescribedTag]:
     total = len(piece.reads[0])
-    size = 1 if total <= SINGLE_BITS else min(MAX_BITS_PER_TAG, limit)
+    size = 1 if total <= SINGLE_BITS else min(MAX_BITS_PER_TAG, piece.limit)
     for first in range(0, total, size):
         count = min(size, total - first)
         kind = "bool" if count == 1 else f"bool[{count}]"
