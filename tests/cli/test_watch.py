@@ -322,6 +322,51 @@ def test_a_device_that_refuses_reads_across_borders_is_watched_in_parts() -> Non
     assert result.stderr.splitlines()[-1] == f"watching {device.url}, unit 1"
 
 
+@pytest.mark.parametrize(
+    ("code", "times", "end"),
+    [
+        (3, 1000, ["holding_registers 17 is not watched: exception 03 (Illegal Data Value)"]),
+        (6, 1, []),
+    ],
+)
+def test_what_a_device_refuses_after_the_search_is_left_out_and_told(
+    code: int, times: int, end: list[str]
+) -> None:
+    """The search asks for coils last."""
+    failures = iter(range(times))
+
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 3 or count > 20 or first + count > 50:
+            return exception(pdu, 2)
+        is_searched = any(each[0] == 1 for each in device.asked)
+        if is_searched and first <= 17 < first + count and next(failures, None) is not None:
+            return exception(pdu, code)
+        return registers(pdu)
+
+    with FakeDevice(answers) as device:
+        result = invoke("watch", device.url, "--times", "2", *OFTEN)
+        reads = [each[1:] for each in device.asked[-6:]]
+    assert (result.exit_code, result.stdout) == (0, "")
+    told = [f"{device.url}, unit 1: searching for addresses", *end]
+    assert result.stderr.splitlines() == [*told, f"watching {device.url}, unit 1"]
+    left_out = [each for each in reads if each[1] <= 17 < each[1] + each[3]]
+    assert bool(left_out) == (not end)
+
+
+def test_a_device_that_fails_after_the_search_is_not_watched_in_part() -> None:
+    def answers(pdu: bytes) -> bytes:
+        first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
+        if pdu[0] != 3 or count > 20 or first + count > 50:
+            return exception(pdu, 2)
+        is_searched = any(each[0] == 1 for each in device.asked)
+        return exception(pdu, 4) if is_searched and first <= 17 < first + count else registers(pdu)
+
+    with FakeDevice(answers) as device:
+        error = failure("watch", device.url, *OFTEN)[-1]
+    assert error == f"holdfast: {device.url}, unit 1: exception 04 (Server Device Failure)"
+
+
 def test_a_device_without_addresses_can_not_be_watched() -> None:
     with FakeDevice(lambda pdu: exception(pdu, 1)) as device:
         assert failure("watch", device.url)[-1] == f"holdfast: {device.url}: no address was found"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli import device_errors, standard_output, terminal_text
+from holdfast.cli.devices import coverage
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.live import schedule, sources
 from holdfast.cli.live.changes import Tracker
@@ -26,13 +27,14 @@ from holdfast.cli.signals import sigterm_as_ctrl_c
 from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
 from holdfast.cli.terminal_text import print_json
+from holdfast.client.requests import REFUSALS
 from holdfast.discovery import address_search
 from holdfast.discovery.address_search import Probe
 from holdfast.errors import ModbusError, ModbusException
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from holdfast.cli.live.changes import Change
     from holdfast.cli.live.sources import Source
@@ -174,16 +176,28 @@ def _device(
     return sources.DeviceSource(where, url, client, blocks)
 
 
-def _parts(client: SyncClient, found: AreaMap, extent: range) -> Iterator[Probe]:
-    """A range, in parts that the device returns, if it takes less at once than the standard."""
-    if not found.takes_less:
-        yield Probe(found.area, extent.start, len(extent))
-        return
-    for block in found.blocks(extent):
-        probe = Probe(found.area, block.start, len(block))
-        for part, content in address_search.read_in_parts(client.read, probe, found.width):
-            if not isinstance(content, ModbusException):
-                yield part
+def _parts(client: SyncClient, found: AreaMap, extent: range) -> list[Probe]:
+    """A range, in parts that the device returns, if it takes less at once than the standard.
+
+    What it refuses meanwhile is left out, which is told. Other errors may pass: the first reading
+    decides.
+    """
+    blocks = [
+        Probe(found.area, first, min(found.limit, extent.stop - first))
+        for first in range(extent.start, extent.stop, found.limit)
+    ]
+    parts = []
+    for block in blocks:
+        for part, content in address_search.read_in_parts(client.read, block, found.width):
+            if isinstance(content, ModbusException) and content.code in REFUSALS:
+                at = coverage.shown([range(part.address, part.address + part.count)])
+                click.echo(f"{part.area} {at} is not watched: {content}", err=True)
+            else:
+                parts.append(part)
+    # In a short range, the search does not find that a device takes less.
+    if parts == blocks and not found.takes_less:
+        return [Probe(found.area, extent.start, len(extent))]
+    return parts
 
 
 def _appliance(
