@@ -10,7 +10,7 @@ import tempfile
 import threading
 from contextlib import ExitStack, suppress
 from functools import partial
-from multiprocessing.connection import Listener
+from multiprocessing.connection import Client, Listener
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -102,6 +102,7 @@ def test_a_path_need_not_be_utf_8() -> None:
 
 @pytest.mark.usefixtures("runtime")
 def test_it_answers_although_no_thread_can_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control, "TIMEOUT_S", 3600.0)
     start = threading.Thread.start
 
     def started(thread: threading.Thread) -> None:
@@ -114,6 +115,9 @@ def test_it_answers_although_no_thread_can_start(monkeypatch: pytest.MonkeyPatch
         with monkeypatch.context() as patch:
             patch.setattr(threading.Thread, "start", started)
             assert [pinged(FILE), pinged(FILE)] == [True, True]
+            # A caller that sends nothing holds up the next one, and a stop, for a moment only.
+            with Client(control._addresses(FILE)[0]):
+                assert pinged(FILE)
         assert pinged(FILE)
     finally:
         running.close()

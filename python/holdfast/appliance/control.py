@@ -30,7 +30,8 @@ MAX_ANSWER_BYTES = 64 * 1024 * 1024
 """The size limits of messages."""
 
 TIMEOUT_S = 5.0
-"""Seconds in which a request must arrive."""
+IN_TURN_TIMEOUT_S = 0.5
+"""Seconds in which a request must arrive: usually, and while callers, and a stop, wait for it."""
 
 ANSWER_S = 3.0
 """Seconds in which an appliance must answer, unless the request takes longer."""
@@ -94,16 +95,20 @@ class Control:
                 continue
             backoff.succeeded()
             serving = threading.Thread(
-                target=self._serve, args=(connection,), name="holdfast-control", daemon=True
+                target=self._serve,
+                args=(connection, TIMEOUT_S),
+                name="holdfast-control",
+                daemon=True,
             )
             try:
                 serving.start()
             except RuntimeError:  # No new thread can start. Meanwhile, callers wait for each other.
-                self._serve(connection)
+                self._serve(connection, IN_TURN_TIMEOUT_S)
 
-    def _serve(self, connection: Any) -> None:  # A connection, of another type on Windows.
+    # A connection is of another type on Windows.
+    def _serve(self, connection: Any, timeout: float) -> None:
         with contextlib.suppress(OSError, EOFError), connection:
-            if not connection.poll(TIMEOUT_S):
+            if not connection.poll(timeout):
                 return
             answer = self._answer(connection.recv_bytes(MAX_REQUEST_BYTES))
             connection.send_bytes(json.dumps(answer).encode())
