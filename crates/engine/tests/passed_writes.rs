@@ -8,10 +8,10 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use holdfast_engine::client::Place;
-use holdfast_engine::link::{Caller, InFlight, LinkSettings};
+use holdfast_engine::link::{Caller, Fault, InFlight, LinkSettings};
 use holdfast_engine::poller::plan::{PlanLimits, Strategy};
 use holdfast_engine::poller::{
-    Destination, DeviceSettings, Passage, PassedRange, Poller, ReadSettings,
+    Destination, DeviceSettings, Passage, PassedRange, Poller, ReadSettings, Written,
 };
 use holdfast_memory::{Access, Area, Done, Journal, Layout, Memory, Read, Span, Step};
 use holdfast_protocol::client::MAX_READ_DELAY;
@@ -230,8 +230,8 @@ fn a_write_that_waits_through_a_standstill_is_not_sent() {
     let memory = memory();
     let ((sender, steps), (goes_on, held)) = (channel(), channel());
     memory.keep_in(Arc::new(Holding(Manual(Mutex::new(sender)), Mutex::new(held))), 0);
-    let carry_out = |time: Duration| {
-        let Waiting(step, done) = steps.recv_timeout(TIMEOUT).expect("the journal has a step");
+    let submitted = || steps.recv_timeout(TIMEOUT).expect("the journal has a step");
+    let carry_out = |Waiting(step, done): Waiting, time: Duration| {
         let began = Instant::now();
         while began.elapsed() < time {
             thread::yield_now();
@@ -247,7 +247,7 @@ fn a_write_that_waits_through_a_standstill_is_not_sent() {
     });
     let settings = settings("meter", address, &memory);
     let poller = Poller::start(vec![settings.clone()]).unwrap();
-    carry_out(Duration::ZERO);
+    carry_out(submitted(), Duration::ZERO);
 
     let passage = passage(&poller, "meter", &memory);
     let link = poller.link(LinkSettings {
@@ -271,7 +271,10 @@ fn a_write_that_waits_through_a_standstill_is_not_sent() {
     let waiting = [passage.call(&caller, &write), call(&write), call(&read)];
     answers.send(()).unwrap();
     // The thread of the poller waits for its journal.
-    carry_out(MAX_READ_DELAY * 3 / 2);
+    let step = submitted();
+    let results = poller.receiver();
+    let of_tag = poller.write("meter", Box::new(EncodedRequest::new(&write)), None, &results);
+    carry_out(step, MAX_READ_DELAY * 3 / 2);
 
     let began = Instant::now();
     let mut ended = Vec::new();
@@ -290,5 +293,12 @@ fn a_write_that_waits_through_a_standstill_is_not_sent() {
     assert_eq!(outcome(waiting[1]), (false, "not sent: it has waited too long".into()));
     assert_eq!(outcome(waiting[2]), (true, "done".into()), "a read");
     assert_eq!(link.counters.withdrawn.get(), 1);
+    let of_tag = Written { ticket: of_tag.unwrap(), outcome: Err(Fault::Expired) };
+    let mut written = Vec::new();
+    while written.is_empty() {
+        assert!(began.elapsed() < TIMEOUT, "the tag has no result");
+        written = results.take(TIMEOUT).writes;
+    }
+    assert_eq!(written, [of_tag]);
     assert!(asked.try_recv().is_err(), "the device has another write");
 }

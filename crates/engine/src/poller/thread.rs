@@ -150,6 +150,8 @@ enum Command {
         device: String,
         ticket: u64,
         request: Box<EncodedRequest>,
+        /// When it came, by [`time_since_boot`].
+        queued: Duration,
         until: Option<Instant>,
         to: Arc<Results>,
     },
@@ -364,8 +366,8 @@ impl Poller {
             return Err(PollerError::Unknown { device: name.to_owned() });
         }
         let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
-        let to = Arc::clone(to);
-        self.send(Command::Write { device: name.to_owned(), ticket, request, until, to })?;
+        let (device, queued, to) = (name.to_owned(), time_since_boot(), Arc::clone(to));
+        self.send(Command::Write { device, ticket, request, queued, until, to })?;
         Ok(ticket)
     }
 
@@ -551,10 +553,12 @@ async fn run_commands(
                     links.device_left(left);
                 }
             }
-            Command::Write { device, ticket, request, until, to } => match running.get(&device) {
-                Some(device) => device.write(ticket, request, until, to),
-                None => to.push_write(Written { ticket, outcome: Err(Fault::Withdrawn) }),
-            },
+            Command::Write { device, ticket, request, queued, until, to } => {
+                match running.get(&device) {
+                    Some(device) => device.write(ticket, request, (queued, until), to),
+                    None => to.push_write(Written { ticket, outcome: Err(Fault::Withdrawn) }),
+                }
+            }
         }
     }
 }
@@ -647,7 +651,7 @@ impl Running {
         &self,
         ticket: u64,
         request: Box<EncodedRequest>,
-        until: Option<Instant>,
+        (queued, until): (Duration, Option<Instant>),
         to: Arc<Results>,
     ) {
         let (link, turn) = (Rc::clone(&self.link.0), Rc::clone(&self.turn));
@@ -658,7 +662,7 @@ impl Running {
         let is_sent = Arc::new(OnceLock::new());
         let mut device = self.writes.subscribe();
         let sent = Arc::clone(&is_sent);
-        let permit = self.permit(until).and(standstill::none_since(time_since_boot()));
+        let permit = self.permit(until).and(standstill::none_since(queued));
         let permit = permit.and(Arc::new(move |is_sent| match is_sent {
             true => *sent.get_or_init(|| true),
             false => true,
