@@ -400,22 +400,21 @@ fn each_invalid_response_has_a_word_for_programs() {
     }
 }
 
-/// A connection that has had one echo, and now the bytes of one that may also be the reply.
-fn with_what_may_be_an_echo(transport: Transport) -> Client {
+/// A connection that has had one echo, and now the bytes of one that may also be the reply, with others behind it.
+fn with_what_may_be_an_echo(transport: Transport, behind: &[u8]) -> Client {
     let mut client = Client::new(transport, Tolerance::default());
     client.read_in_time(1, true);
     client.after(SECOND);
     client.send(&EncodedRequest::parse(&COILS).unwrap());
     client.after(SILENCE);
     assert_eq!(client.outgoing(), rtu_frame(&COILS));
-    client.receive(&rtu_frame(&[1, 3, 0xC8, 0, 24]));
-    assert_eq!(client.got(), []);
+    client.receive(&[&rtu_frame(&[1, 3, 0xC8, 0, 24]), behind].concat());
     client
 }
 
 #[test]
 fn a_reply_that_follows_an_equal_echo_is_believed_when_it_is_complete() {
-    let mut client = with_what_may_be_an_echo(RTU);
+    let mut client = with_what_may_be_an_echo(RTU, &[]);
     let reply = rtu_frame(&[1, 3, 0xC8, 0, 24]);
     let (last, others) = reply.split_last().unwrap();
     for byte in others {
@@ -427,8 +426,35 @@ fn a_reply_that_follows_an_equal_echo_is_believed_when_it_is_complete() {
 }
 
 #[test]
+fn noise_between_an_echo_and_an_equal_reply_is_no_other_reply() {
+    let reply = rtu_frame(&[1, 3, 0xC8, 0, 24]);
+    for noise in [&[0][..], &[0xFF, 0], &[7], &[7, 1]] {
+        for (behind, rest) in [
+            (noise.to_vec(), vec![reply.clone()]),
+            (vec![], vec![noise.to_vec(), reply.clone()]),
+            (vec![], vec![[noise, &reply].concat()]),
+            ([noise, &reply[..4]].concat(), vec![reply[4..].to_vec()]),
+            ([noise, &reply].concat(), vec![]),
+        ] {
+            let mut client = with_what_may_be_an_echo(RTU, &behind);
+            rest.iter().for_each(|bytes| client.receive(bytes));
+            assert_eq!(client.got(), [Ok(vec![1, 3, 0xC8, 0, 24])], "{behind:?} {rest:?}");
+        }
+    }
+}
+
+#[test]
+fn other_bytes_behind_what_may_be_an_echo_are_another_reply() {
+    for behind in [&rtu_frame(&[1, 3, 0xC8, 0, 25])[..], &[0, 0, 0, 7, 1, 3, 0xC8, 0, 24]] {
+        let mut client = with_what_may_be_an_echo(RTU, &[]);
+        client.receive(behind);
+        assert_eq!(client.got(), [Err(Failure::Invalid(InvalidResponse::Unrequested))]);
+    }
+}
+
+#[test]
 fn what_may_have_been_an_echo_is_no_reply_which_may_still_come() {
-    let mut client = with_what_may_be_an_echo(RTU);
+    let mut client = with_what_may_be_an_echo(RTU, &[]);
     client.after(SECOND);
     assert_eq!(client.got(), [Err(Failure::Timeout)]);
     client.send(&EncodedRequest::parse(&COILS).unwrap());
@@ -511,7 +537,7 @@ fn what_may_be_another_reply_contradicts_one_that_is_doubted() {
 
 #[test]
 fn what_a_stream_has_brought_before_it_ends_is_a_reply_unless_it_may_be_an_echo() {
-    let mut client = with_what_may_be_an_echo(Transport::RtuOverTcp);
+    let mut client = with_what_may_be_an_echo(Transport::RtuOverTcp, &[]);
     client.close();
     assert_eq!(client.got(), [Err(Failure::Closed(Closed::ByPeer))]);
 

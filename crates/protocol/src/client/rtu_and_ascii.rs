@@ -410,6 +410,9 @@ impl OneAtATime {
             // What came behind it is kept: another reply may have begun.
             (self.doubted, self.is_maybe_echo) = (Some((unit_id, pdu, now)), is_like_echo);
             self.state = State::Doubting { until: until.max(now + GUARD) };
+            if is_like_echo {
+                self.after_doubted(flights, &[], now, sink);
+            }
             return;
         }
         self.replied(flights, (unit_id, &pdu, now), now, sink);
@@ -453,11 +456,16 @@ impl OneAtATime {
     ) {
         let room = self.max_received() - self.received.len();
         self.received.extend_from_slice(&bytes[..bytes.len().min(room)]);
-        if self.is_maybe_echo && self.frame == self.received {
+        // There may be noise between an echo and the reply.
+        let noise = (0..=MAX_NOISE_BYTES).find(|noise| {
+            let behind = self.received.get(*noise..).filter(|behind| !behind.is_empty());
+            self.is_maybe_echo && behind.is_some_and(|behind| self.frame.starts_with(behind))
+        });
+        if noise.is_some_and(|noise| self.received.len() - noise == self.frame.len()) {
             self.late_replies.echoes = self.late_replies.echoes.saturating_add(1);
             return self.believe_doubted(flights, now, sink);
         }
-        if self.is_maybe_echo && self.frame.starts_with(&self.received) {
+        if noise.is_some() {
             return;
         }
         if !flights.tolerance.pad {
