@@ -13,8 +13,8 @@ const DELAY: Duration = Duration::from_millis(40);
 /// How much later an echo may come over a network, to a serial server.
 const SLOW: Duration = Duration::from_millis(250);
 
-/// How long after a write that was taken for a slow echo a master that waits for its reply repeats it.
-const REPEATED_WITHIN: Duration = Duration::from_secs(3);
+/// As many more are carried out of a write that came again after it was taken for a slow echo.
+const REPEATED: u8 = 4;
 
 /// The last reply, until a request has come, and whether the line has an echo.
 #[derive(Debug, Default)]
@@ -37,9 +37,9 @@ pub(super) struct LineEcho {
 enum Slow {
     #[default]
     Nothing,
-    /// It was carried out.
-    Once,
-    /// The second time in a row it was taken for an echo.
+    /// It was carried out. So are as many more of them in a row.
+    CarriedOut(u8),
+    /// It was taken for an echo.
     Dropped,
 }
 
@@ -100,16 +100,15 @@ impl LineEcho {
 
     /// Judges a write that equals the last one and its reply, on a line of which nothing else is known.
     fn slow_echo(&mut self, now: Instant) -> usize {
-        let within = |time| self.until.is_some_and(|until| now <= until + time);
+        let is_slow = self.until.is_some_and(|until| now <= until + SLOW);
         self.slow = match self.slow {
-            Slow::Dropped if within(REPEATED_WITHIN) => {
-                // It had no reply that could come back: the master has repeated it.
-                self.known = Known::NoEcho;
-                Slow::Nothing
-            }
-            Slow::Once if within(SLOW) => Slow::Dropped,
-            _ if within(SLOW) => Slow::Once,
-            _ => Slow::Nothing,
+            // It had no reply that could come back: the master has repeated it. That does not show that the line
+            // has no echo.
+            Slow::Dropped => Slow::CarriedOut(REPEATED),
+            _ if !is_slow => Slow::Nothing,
+            Slow::Nothing => Slow::CarriedOut(0),
+            Slow::CarriedOut(0) => Slow::Dropped,
+            Slow::CarriedOut(more) => Slow::CarriedOut(more - 1),
         };
         if let Slow::Dropped = self.slow {
             // It is kept, to be known when it comes again.
@@ -278,20 +277,24 @@ mod tests {
     const MUCH_LATER: Duration = Duration::from_secs(3600);
 
     #[test]
-    fn the_slow_echo_of_a_write_is_carried_out_once_at_most() {
+    fn the_slow_echo_of_a_write_is_not_carried_out_without_end() {
         let mut echo = LineEcho::default();
-        for _ in 0..3 {
-            let carried_out = [MUCH_LATER, SLOW, SLOW].map(|later| write(&mut echo, later));
-            assert_eq!(carried_out, [true, true, false]);
-        }
+        let echoes = [1, REPEATED, REPEATED].map(|most| {
+            assert!(write(&mut echo, Duration::from_secs(1)), "it is no echo");
+            (0..=most).take_while(|_| write(&mut echo, SLOW)).count()
+        });
+        assert_eq!(echoes, [1, REPEATED, REPEATED].map(usize::from));
     }
 
     #[test]
     fn a_master_that_repeats_a_write_is_answered_when_it_asks_again() {
-        let mut echo = LineEcho::default();
-        let later = [MUCH_LATER, SLOW, SLOW, REPEATED_WITHIN, SLOW, SLOW, SLOW, SLOW];
-        let carried_out = later.map(|later| write(&mut echo, later));
-        assert_eq!(carried_out, [true, true, false, true, true, true, true, true]);
+        for later in [SLOW, MUCH_LATER] {
+            let mut echo = LineEcho::default();
+            let unanswered = (0..100).filter(|_| !write(&mut echo, SLOW)).count();
+            assert!(unanswered <= 100 / usize::from(REPEATED));
+            assert!((0..=REPEATED).any(|_| !write(&mut echo, SLOW)));
+            assert!(write(&mut echo, later));
+        }
     }
 
     #[test]
