@@ -4,20 +4,25 @@ from __future__ import annotations
 
 import json
 import signal
+import sys
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from holdfast import SyncClient, _core
-from holdfast.cli.signals import Interrupted, ending_signals, interruptions
+from holdfast.cli.signals import (
+    Interrupted,
+    Signals,
+    ending_signals,
+    interruptions,
+    keep_hangups,
+)
 from support.cli import answer, invoke
 from support.fake_device import FakeDevice
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
-
-    from holdfast.cli.signals import Signals
 
 
 def test_a_signal_ends_a_search_after_what_must_not_be_cut() -> None:
@@ -48,6 +53,36 @@ def test_a_signal_behind_the_search_does_not_cut_the_output() -> None:
         with pytest.raises(Interrupted), signals.interrupting():
             done.append("next search")
     assert done == ["search", "output"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGHUP")
+def test_sighup_while_handlers_are_set_is_a_reload(monkeypatch: pytest.MonkeyPatch) -> None:
+    numbers = list(ending_signals())
+    before = {number: signal.getsignal(number) for number in numbers}
+    set_handler = signal.signal
+
+    def hang_up(after: signal.Signals) -> None:
+        left = [after]
+
+        def signal_then_hangup(number: signal.Signals, handler: Any) -> None:
+            set_handler(number, handler)
+            if number in left:
+                left.clear()
+                signal.raise_signal(signal.SIGHUP)
+
+        monkeypatch.setattr("holdfast.cli.signals._early_hangups", [])
+        keep_hangups()
+        with monkeypatch.context() as patched:
+            patched.setattr(signal, "signal", signal_then_hangup)
+            signals = Signals(reload="always")
+        assert (signals.received, signals.take_reload()) == (False, True), after
+
+    try:
+        for number in numbers:
+            hang_up(number)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def test_handlers_are_as_before_when_the_command_ends() -> None:

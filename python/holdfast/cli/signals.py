@@ -72,12 +72,15 @@ class Signals:
         self._interrupts = False
         self._reload = False
         self._needs_terminal = reload == "with a terminal" and _has_terminal()
+        hangup = None if reload == "never" else getattr(signal, "SIGHUP", None)
         for number in ending_signals():
-            signal.signal(number, self._note)
-        hangup = getattr(signal, "SIGHUP", None)
-        if reload != "never" and hangup is not None:
+            if number != hangup:
+                signal.signal(number, self._note)
+        if hangup is not None:
             signal.signal(hangup, self._request_reload)
-            self._reload = bool(_early_hangups)
+            # One that has come since is not lost.
+            if _early_hangups:
+                self._reload = True
 
     @contextmanager
     def interrupting(self) -> Iterator[None]:
