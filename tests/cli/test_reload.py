@@ -150,13 +150,17 @@ def test_sighup_before_the_configuration_is_read_reloads_after_the_start(tmp_pat
     file = tmp_path / "plant.yaml"
     file.write_text(CONFIGURATION.format(size=100, access="read-only", more=""))
     command = [sys.executable, "-c", HANGUP_AT_IMPORT, "run", str(file)]
-    with subprocess.Popen(
-        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    ) as process:
-        assert process.stderr is not None
-        assert any("info reloaded" in line for line in process.stderr), "it has ended"
-        process.terminate()
-    assert process.returncode == 0
+    log = tmp_path / "log"
+    with (
+        log.open("w") as stderr,
+        subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=stderr) as process,
+    ):
+        try:
+            wire.until(lambda: "info reloaded" in log.read_text(), "it has reloaded")
+            process.terminate()
+            assert process.wait(wire.DEADLINE) == 0
+        finally:
+            process.kill()
 
 
 def test_a_watched_file_reloads_when_another_one_takes_its_place(
