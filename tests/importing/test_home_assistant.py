@@ -928,9 +928,14 @@ def test_a_file_without_hubs_is_refused(imported: Callable[..., Imported], text:
         imported("", text)
 
 
-def test_an_octal_number_is_refused(imported: Callable[..., Imported]) -> None:
-    with pytest.raises(NotImportable, match="which the source read as octal, allowed: 64"):
-        imported("sensors: [{name: a, address: 0100}]")
+@pytest.mark.parametrize("above", ["default_config:", "# \x85 \u2028 \u2029\r# \r\n#"])
+def test_an_octal_number_is_refused(imported: Callable[..., Imported], above: str) -> None:
+    hub = HUB.replace("default_config:", above)
+    for address in ("0100", "&x 0100", "!!int &x 0100"):
+        with pytest.raises(NotImportable, match="found 0100, .* as octal, allowed: 64"):
+            imported(f"sensors: [{{name: a, address: {address}}}]", hub)
+    with pytest.raises(ConfigError, match="line hidden, as it may contain a secret"):
+        imported("password: a: hunter2", hub)
 
 
 def test_actions_that_write_are_noted_with_what_replaces_them(

@@ -21,7 +21,12 @@ if TYPE_CHECKING:
 Generation: TypeAlias = Literal[1, 2]
 ORDINALS: dict[Generation, str] = {1: "first", 2: "second"}
 
-_OCTAL = re.compile(r"0[0-7]+(?![0-9A-Za-z_.:-])", re.ASCII)
+_BREAK = re.compile(r"\r\n|\r|\n")
+"""What ends a line of YAML; `splitlines` also takes U+2028, of which YAML counts none."""
+
+_OCTAL = re.compile(r"(?:[&!]\S*[ \t]+)*([-+]?0[0-7]+)(?![0-9A-Za-z_.:-])", re.ASCII)
+"""An octal number of YAML 1.1, behind its anchor and tag, where the place of a value is."""
+
 _SECRET = re.compile(r"(token|password|broker)[\"']?\s*:")
 
 
@@ -70,14 +75,14 @@ class Source:
         """
         self.file = str(path)
         text = yaml_document.read_text(Path(path), self.file)
-        self._lines = {self.file: text.splitlines()}
+        self._lines = {self.file: _BREAK.split(text)}
         """The lines of each file."""
 
         def known(kind: str, text: str, file: str) -> Any:
             assert resolve is not None, "only with it are tags given a value"
             found = resolve(kind, text, file)
             if isinstance(found, yaml_document.Included):
-                self._lines[found.file] = found.text.splitlines()
+                self._lines[found.file] = _BREAK.split(found.text)
             return found
 
         try:
@@ -129,8 +134,8 @@ class Source:
         elif type(value) is int:
             place = self.desk.document.place(path)
             written = _OCTAL.match(self._line(place.file, place.line), place.column - 1)
-            if written is not None and (octal := int(written[0], 8)) != value:
-                message = f"found {written[0]}, which the source read as octal, allowed: {octal}"
+            if written is not None and (octal := int(written[1], 8)) != value:
+                message = f"found {written[1]}, which the source read as octal, allowed: {octal}"
                 self.desk.problem(path, f"{message}, or {value} if that is meant")
 
     def _without_secrets(self, problems: Iterable[Problem]) -> list[Problem]:
