@@ -755,6 +755,18 @@ def test_secrets_are_not_shown_and_are_single_values(
     found = refusals(raised.value)
     assert len(found) == 2
     assert not [message for message in found if "hunter2" in message]
+    (tmp_path / "secrets.yaml").write_text("low: 0100\nother: 0200\n")
+    with pytest.raises(NotImportable) as raised:
+        imported("sensors: [{name: a, address: !secret low}]")
+    octal = "found the secret low, which the source read as octal"
+    assert refusals(raised.value) == [
+        f"8: modbus[0].sensors[0].address: {octal}, allowed: a number without a 0 in front"
+    ]
+    (tmp_path / "inside").mkdir()
+    (tmp_path / "inside" / "secrets.yaml").write_text("low:\n")
+    (tmp_path / "inside" / "a.yaml").write_text("{name: a, address: !secret low}\n")
+    with pytest.raises(NotImportable, match="found the secret low without a value, allowed: text"):
+        imported("sensors: !include inside/a.yaml")
     (tmp_path / "secrets.yaml").write_text("word: [\n")
     with pytest.raises(NotImportable, match="is not YAML that can be read"):
         imported("sensors: [{name: a, address: !secret word}]")
@@ -932,7 +944,7 @@ def test_a_file_without_hubs_is_refused(imported: Callable[..., Imported], text:
 def test_an_octal_number_is_refused(imported: Callable[..., Imported], above: str) -> None:
     hub = HUB.replace("default_config:", above)
     for address in ("0100", "&x 0100", "!!int &x 0100"):
-        with pytest.raises(NotImportable, match="found 0100, .* as octal, allowed: 64"):
+        with pytest.raises(NotImportable, match=r"found 0100, .* as octal, allowed: 64"):
             imported(f"sensors: [{{name: a, address: {address}}}]", hub)
     with pytest.raises(ConfigError, match="line hidden, as it may contain a secret"):
         imported("password: a: hunter2", hub)

@@ -133,7 +133,7 @@ class _Tags:
 
     def __init__(self, folder: Path) -> None:
         self._folder = _real(folder)
-        self._secrets: dict[Path, dict[Any, Any]] = {}
+        self._secrets: dict[Path, Desk | None] = {}
         self._includes_left = _MAX_INCLUDES
 
     def resolve(self, kind: str, text: str, file: str) -> Any:
@@ -167,13 +167,13 @@ class _Tags:
         for each in (folder, *folder.parents):
             if each not in self._secrets:
                 self._secrets[each] = _secrets(each / "secrets.yaml")
-            found = self._secrets[each].get(name)
-            if found is not None or each == self._folder:
+            desk = self._secrets[each]
+            if desk is not None and desk.document.holds((name,)):
+                return _secret_of(desk, name)
+            if each == self._folder:
                 break
-        if found is None or isinstance(found, dict | list):
-            missing = "which is not in secrets.yaml beside the imported file"
-            raise ValueError(f"found the secret {name}, {missing}, allowed: its value")
-        return Secret(found) if isinstance(found, str) else found
+        missing = "which is not in secrets.yaml beside the imported file"
+        raise ValueError(f"found the secret {name}, {missing}, allowed: its value")
 
 
 def _real(path: Path) -> Path:
@@ -181,15 +181,24 @@ def _real(path: Path) -> Path:
     return Path(os.path.realpath(path))
 
 
-def _secrets(file: Path) -> dict[Any, Any]:
+def _secrets(file: Path) -> Desk | None:
     if not file.exists():
-        return {}
-    name = str(file)
+        return None
     try:
-        data = yaml_document.parse(yaml_document.read_text(file, name), name, merges=True)[0].data
+        return Source(file, lambda kind, text, _: yaml_document.scalar(text, kind)).desk
     except ConfigError:
-        raise ValueError(f"found a secret, but {name} is not YAML that can be read") from None
-    return data if isinstance(data, dict) else {}
+        raise ValueError(f"found a secret, but {file} is not YAML that can be read") from None
+
+
+def _secret_of(desk: Desk, name: str) -> Any:
+    """The value of a secret that a file has; messages never show it."""
+    found = desk.report.raw((name,))
+    if found is None or isinstance(found, dict | list):
+        raise ValueError(f"found the secret {name} without a value, allowed: text or a number")
+    if desk.document.spell((name,)) in {problem.key for problem in desk.report.problems}:
+        allowed = "allowed: a number without a 0 in front"
+        raise ValueError(f"found the secret {name}, which the source read as octal, {allowed}")
+    return Secret(found) if isinstance(found, str) else found
 
 
 def _config(devices: dict[str, dict[str, Any]]) -> dict[str, Any]:
