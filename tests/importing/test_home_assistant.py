@@ -528,7 +528,8 @@ def test_each_unit_id_of_a_hub_is_a_device_with_its_own_interval(
     found = imported(
         "sensors: [{name: a, address: 1, slave: 1, scan_interval: 30}, "
         "{name: b, address: 2, device_address: 2, scan_interval: 5}, "
-        "{name: c, address: 3, slave: 1, scan_interval: 10}, {name: d, address: 4}]"
+        "{name: c, address: 3, slave: 1, scan_interval: 10}, {name: d, address: 4}, "
+        "{name: left out, address: 5, slave: 1, scan_interval: 1, scale: 0}]"
     )
     devices = found.data["devices"]
     assert {name: (d["unit"], d["interval"]) for name, d in devices.items()} == {

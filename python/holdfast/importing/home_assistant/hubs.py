@@ -355,15 +355,18 @@ class _Hub:
             self.desk.check(entity.path, message)
         unit = self.units.setdefault(1 if number is None else number, _Unit(Places(self.desk)))
         interval = entity.integer("scan_interval", 0, 86_400, what="seconds")
-        if interval == 0:
+        known = len(unit.places.tags)
+        if entity.text("name", required=True) is not None:
+            unit.places.at = entity.path
+            convert(unit.places, entity)
+        if len(unit.places.tags) == known:
+            pass  # What is left out is not polled.
+        elif interval == 0:
             self.desk.changed(entity.at("scan_interval"), "polled with the others of its device")
         elif interval is not None:
             unit.intervals.append((entity.at("scan_interval"), interval))
         else:
             unit.intervals.append((entity.path, SCAN_INTERVAL_S))
-        if entity.text("name", required=True) is not None:
-            unit.places.at = entity.path
-            convert(unit.places, entity)
         entity.close(_ENTITY_REASONS)
 
     def _network(self, kind: str) -> str:
