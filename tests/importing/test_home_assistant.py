@@ -744,6 +744,31 @@ def test_a_problem_of_an_anchor_elsewhere_is_one_of_its_alias(
     ]
 
 
+def test_a_problem_of_an_included_file_has_its_place_also_for_an_alias(
+    imported: Callable[..., Imported], tmp_path: Path
+) -> None:
+    (tmp_path / "b.yaml").write_text("x: 1\npassword: *hunter2\n")
+    hub = HUB.replace("default_config:", "x: &x !include b.yaml")
+    with pytest.raises(NotImportable) as raised:
+        imported("sensors: *x", hub)
+    hidden = "not YAML (line hidden, as it may contain a secret), allowed: text in quotes"
+    assert refusals(raised.value) == [f"2: modbus[0].sensors: {hidden}"]
+    assert raised.value.problems[0].file == str(tmp_path / "b.yaml")
+
+
+def test_an_alias_of_aliases_has_the_first_problems_of_its_anchor(
+    imported: Callable[..., Imported],
+) -> None:
+    levels = [f"a{level}: &a{level} [{f'*a{level - 1}, ' * 10}]" for level in range(1, 4)]
+    anchors = "\n".join(["a0: &a0 [!no 1, !no 2, !no 3, !no 4]", *levels])
+    with pytest.raises(NotImportable) as raised:
+        imported("sensors: *a3", HUB.replace("default_config:", anchors))
+    allowed = "allowed: what it stands for"
+    assert refusals(raised.value) == [
+        f"11: modbus[0].sensors: found !no {number}, {allowed}" for number in (1, 2, 3)
+    ]
+
+
 def test_secrets_are_not_shown_and_are_single_values(
     imported: Callable[..., Imported], tmp_path: Path
 ) -> None:

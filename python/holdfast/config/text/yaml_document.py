@@ -42,6 +42,9 @@ MAX_VALUES = 1_000_000
 _MAX_DEPTH = 10
 """Maximum number of files inside each other."""
 
+_MAX_MISTAKES = 3
+"""Maximum number of mistakes of an anchor that each alias has: they grow with each level."""
+
 _TAG = "tag:yaml.org,2002:"
 _WORDS: Final[dict[str, bool | None]] = {
     **dict.fromkeys(("", "~", "null", "Null", "NULL")),
@@ -264,9 +267,9 @@ class _Reader:
         """The files inside each other whose events are read; the last one is the innermost."""
         self._resolve = resolve
         self._merges = merges
-        self._mistakes_of: dict[int | str, list[str]] = {}
-        """The mistakes inside an anchor, which are also those of its aliases: only a part of a file
-        of another program may be read."""
+        self._mistakes_of: dict[int | str, list[tuple[Place, str]]] = {}
+        """The first mistakes inside an anchor, which are also those of its aliases: only a part of
+        a file of another program may be read."""
         self.mistakes: list[tuple[Place, KeyPath, str]] = []
         self.repeated: list[tuple[KeyPath, int]] = []
         self._events = iter(_events(text, file, max_written))
@@ -297,14 +300,16 @@ class _Reader:
         known = len(self.mistakes)
         value = self._anchors[anchor] = self._new_value(event, path)
         if self._resolve is not None:
-            self._mistakes_of[anchor] = [message for _, _, message in self.mistakes[known:]]
+            first = self.mistakes[known : known + _MAX_MISTAKES]
+            self._mistakes_of[anchor] = [(place, message) for place, _, message in first]
         return value
 
     def _aliased(self, event: YamlEvent, anchor: int | str, path: KeyPath) -> tuple[Any, _Spot]:
         value = self._anchors[anchor]
         if value is not None:
-            for message in self._mistakes_of.get(anchor, ()):
-                self._add(event, path, message)
+            for place, message in self._mistakes_of.get(anchor, ()):
+                is_here = place.file == self._files[-1]
+                self.mistakes.append((self._place(event) if is_here else place, path, message))
             return value
         return self._refused(event, path, "an alias inside its own anchor is not allowed")
 
