@@ -711,6 +711,46 @@ def test_packages_that_are_not_read_are_noted(imported: Callable[..., Imported])
     ]
 
 
+@pytest.mark.parametrize(
+    ("above", "key"),
+    [
+        ("<<: !include nope.yaml", "'<<'"),
+        ("<<: [!include nope.yaml]", "'<<'.0"),
+        ("homeassistant: !include nope.yaml", "homeassistant"),
+        ("homeassistant: {packages: [!include nope.yaml]}", "homeassistant.packages[0]"),
+        ("homeassistant: {packages: {a.b: !include nope.yaml}}", "homeassistant.packages.'a.b'"),
+        ("homeassistant: {packages: {a: !include merge.yaml}}", "homeassistant.packages.a.'<<'"),
+        ("homeassistant: {packages: {a: {sensor: !include nope.yaml}}}", None),
+        ("frontend: !include nope.yaml", None),
+        ("pv: {modbus: []}\nother: !include nope.yaml\n", "other"),
+    ],
+)
+def test_what_may_have_hubs_and_is_not_read_is_noted(
+    imported: Callable[..., Imported], tmp_path: Path, above: str, key: str | None
+) -> None:
+    (tmp_path / "automations.yaml").write_text("[]\n")
+    (tmp_path / "merge.yaml").write_text("<<: !include nope.yaml\n")
+    found = imported("sensors: [{name: a, address: 1}]", HUB.replace("default_config:", above))
+    left_out = [note for note in found.notes if note.kind == "left out"]
+    assert [note.key for note in left_out] == ([] if key is None else [key])
+    assert all(
+        "but nope.yaml: can't be read" in each.message.replace(f"{tmp_path}{os.sep}", "")
+        for each in left_out
+    )
+
+
+@pytest.mark.parametrize("value", ["!include hubs.yaml", "[!include hubs.yaml]"])
+def test_a_problem_of_a_section_that_is_merged_is_one_of_the_section(
+    imported: Callable[..., Imported], tmp_path: Path, value: str
+) -> None:
+    hub = HUB.partition("modbus:")[2].replace(
+        "{entities}", "sensors: [{name: a, address: 1, slave: !secret unit}]"
+    )
+    (tmp_path / "hubs.yaml").write_text(f"modbus:{hub}")
+    with pytest.raises(NotImportable, match="found the secret unit, which is not in"):
+        imported("", f"<<: {value}\n")
+
+
 def test_entities_of_the_former_form_are_named(imported: Callable[..., Imported]) -> None:
     former = "binary_sensor:\n  - platform: modbus\n    registers: [{hub: h, register: 1}]\n"
     message = (

@@ -96,13 +96,19 @@ class Source:
         self.desk = Desk(document)
         self._look_at((), document.data)
 
-    def narrow(self, paths: Sequence[KeyPath]) -> list[Problem]:
-        """Reads nothing but the values at these paths. Returns the problems elsewhere."""
-        keys = [self.desk.document.spell(path) for path in paths]
-        found, self.problems, elsewhere = self.problems, [], list[Problem]()
-        for each in found:
-            is_inside = any(_is_in(key, each.key) for key in keys)
-            (self.problems if is_inside else elsewhere).append(each)
+    def narrow(self, paths: Sequence[KeyPath]) -> list[tuple[KeyPath, Problem]]:
+        """Reads nothing but the values at these paths. Returns the problems elsewhere, with the
+        paths to which merge keys bring them.
+        """
+        inside: list[Problem] = []
+        elsewhere: list[tuple[KeyPath, Problem]] = []
+        for written, problem in zip(self.desk.document.mistaken, self.problems, strict=True):
+            path = _without_merges(written)
+            if any(path[: len(each)] == each for each in paths):
+                inside.append(problem)
+            else:
+                elsewhere.append((path, problem))
+        self.problems = inside
         self.desk.report.found.clear()
         self.desk.noted.clear()
         for path in paths:
@@ -158,6 +164,10 @@ class Source:
             raise NotImportable(self.file, problems, self.desk.notes)
 
 
-def _is_in(section: str, key: str) -> bool:
-    """Whether the key of a problem is that of a section, or one inside it."""
-    return key == section or key.startswith((f"{section}.", f"{section}["))
+def _without_merges(path: KeyPath) -> KeyPath:
+    """The path at which a value is when the merge keys above it have added it."""
+    return tuple(
+        key
+        for above, key in zip(("", *path), path, strict=False)
+        if key != "<<" and not (above == "<<" and isinstance(key, int))
+    )

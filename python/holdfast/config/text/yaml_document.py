@@ -107,6 +107,8 @@ class Document:
     root: _Spot
     repeated: tuple[tuple[KeyPath, int], ...] = ()
     """The keys that were given before in their mapping, and in which line."""
+    mistaken: tuple[KeyPath, ...] = ()
+    """The paths of its problems, in their order."""
 
     def place(self, path: KeyPath, *, of_key: bool = False) -> Place:
         """The place of a scalar value; for a list or mapping, the place of its key.
@@ -226,7 +228,8 @@ def parse(
     if spot.values > max_values:
         message = f"found {spot.values} values with aliases expanded, allowed: up to {max_values}"
         raise ConfigError(file, [Problem(file, 1, 1, "", message)])
-    document = Document(file, data, spot, tuple(reader.repeated))
+    mistaken = tuple(path for _, path, _ in reader.mistakes)
+    document = Document(file, data, spot, tuple(reader.repeated), mistaken)
     return document, [
         Problem(place.file, place.line, place.column, document.spell(path), message)
         for place, path, message in reader.mistakes

@@ -6,7 +6,6 @@ A hub becomes one device for each unit id that its entities name.
 from __future__ import annotations
 
 import os
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -64,8 +63,7 @@ _MAX_DEPTH = 3
 _MAX_INCLUDES = 300
 """Maximum number of files that are read because others name them, each time counted."""
 
-_PACKAGES = re.compile(r"homeassistant(\.packages(\.[^.]*)?)?")
-"""The keys of packages: of a value that could not be read, nobody knows whether it has hubs."""
+_PACKAGES = ("homeassistant", "packages")
 
 _FORMER = (
     "found platform: modbus, the form before Home Assistant 2021.7, allowed: entities in lists of "
@@ -84,9 +82,9 @@ def read_home_assistant(path: Path | str) -> Imported:
     roots = list(_sections((), desk.document.data))
     former = list(_former((), desk.document.data))
     if roots:
-        for each in source.narrow(roots):
-            if _PACKAGES.fullmatch(each.key):
-                desk.left_out_for(each)
+        for where, problem in source.narrow(roots):
+            if _may_have_hubs(where, roots):
+                desk.left_out_for(problem)
     entries: list[tuple[KeyPath, Any]] = []
     for root in roots or ([] if former else [()]):
         hubs = desk.report.raw(root)
@@ -116,6 +114,13 @@ def _sections(path: KeyPath, data: Any) -> Iterator[KeyPath]:
             yield (*path, key)
         else:
             yield from _sections((*path, key), value)
+
+
+def _may_have_hubs(path: KeyPath, roots: list[KeyPath]) -> bool:
+    """Whether a value that could not be read can be a package, or what has or gives packages."""
+    keys = tuple(key for key in path if isinstance(key, str))
+    is_beside = any(len(root) > 1 and keys[:-1] == root[:-2] for root in roots)
+    return is_beside or (len(keys) <= _MAX_DEPTH and keys[:2] == _PACKAGES[: len(keys)])
 
 
 def _former(path: KeyPath, data: Any) -> Iterator[KeyPath]:
