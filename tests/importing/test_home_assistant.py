@@ -688,6 +688,24 @@ def test_a_link_does_not_lead_out_of_the_folder(
         imported("sensors: !include a.yaml")
 
 
+def test_secrets_are_not_read_from_other_folders(tmp_path: Path) -> None:
+    outside, inside = tmp_path / "outside", tmp_path / "inside"
+    for folder in (outside, inside):
+        folder.mkdir()
+    (outside / "secrets.yaml").write_text("unit: 9\n")
+    (inside / "a.yaml").write_text("- {name: a, address: 1, slave: !secret unit}\n")
+    (inside / "linked").symlink_to(outside, target_is_directory=True)
+    (outside / "a.yaml").symlink_to(inside / "a.yaml")
+    hub = HUB.replace("{entities}", "sensors: !include linked/a.yaml")
+    (inside / "configuration.yaml").write_text(hub)
+    with pytest.raises(NotImportable, match="found the secret unit, which is not in"):
+        read_home_assistant(inside / "configuration.yaml")
+    (inside / "secrets.yaml").symlink_to(outside / "secrets.yaml")
+    (inside / "configuration.yaml").write_text(hub.replace("linked/", ""))
+    with pytest.raises(NotImportable, match=r"secrets\.yaml is a link, allowed: a file in the"):
+        read_home_assistant(inside / "configuration.yaml")
+
+
 def test_files_that_include_others_again_and_again_are_refused(
     imported: Callable[..., Imported], tmp_path: Path
 ) -> None:

@@ -63,6 +63,8 @@ _MAX_DEPTH = 3
 _MAX_INCLUDES = 300
 """Maximum number of files that are read because others name them, each time counted."""
 
+_INSIDE = "a file in the folder of the imported one, or below it"
+
 _PACKAGES = ("homeassistant", "packages")
 
 _FORMER = (
@@ -159,8 +161,7 @@ class _Tags:
                 f"found !include {text}, allowed: {_MAX_INCLUDES} of them in all files"
             )
         if not _real(path).is_relative_to(self._folder):
-            allowed = "a file in the folder of the imported one, or below it"
-            raise ValueError(f"found !include {text}, allowed: {allowed}")
+            raise ValueError(f"found !include {text}, allowed: {_INSIDE}")
         try:
             content = yaml_document.read_text(path, str(path))
         except ConfigError as error:
@@ -170,29 +171,30 @@ class _Tags:
     def _secret(self, name: str, folder: Path) -> Any:
         """The value in the nearest file with secrets, from the folder up, as in the source."""
         for each in (folder, *folder.parents):
+            if not each.is_relative_to(self._folder):
+                break
             if each not in self._secrets:
-                self._secrets[each] = _secrets(each / "secrets.yaml")
+                self._secrets[each] = self._secrets_in(each / "secrets.yaml")
             desk = self._secrets[each]
             if desk is not None and desk.document.holds((name,)):
                 return _secret_of(desk, name)
-            if each == self._folder:
-                break
         missing = "which is not in secrets.yaml beside the imported file"
         raise ValueError(f"found the secret {name}, {missing}, allowed: its value")
+
+    def _secrets_in(self, file: Path) -> Desk | None:
+        if not file.is_file():
+            return None
+        if not _real(file).is_relative_to(self._folder):
+            raise ValueError(f"found a secret, but {file} is a link, allowed: {_INSIDE}")
+        try:
+            return Source(file, lambda kind, text, _: yaml_document.scalar(text, kind)).desk
+        except ConfigError:
+            raise ValueError(f"found a secret, but {file} is not YAML that can be read") from None
 
 
 def _real(path: Path) -> Path:
     """The path without links: only what is in the folder is read."""
     return Path(os.path.realpath(path))
-
-
-def _secrets(file: Path) -> Desk | None:
-    if not file.exists():
-        return None
-    try:
-        return Source(file, lambda kind, text, _: yaml_document.scalar(text, kind)).desk
-    except ConfigError:
-        raise ValueError(f"found a secret, but {file} is not YAML that can be read") from None
 
 
 def _secret_of(desk: Desk, name: str) -> Any:
