@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,9 @@ from hypothesis import strategies as st
 
 from holdfast.cli import main
 from holdfast.config import ConfigError, load
+from holdfast.config.text.problems import ConfigNotAnswered
 from holdfast.importing import NotImportable, read_home_assistant
+from holdfast.runtime import bounded_files
 from holdfast.values import decode, register_count
 
 if TYPE_CHECKING:
@@ -686,6 +689,36 @@ def test_a_link_does_not_lead_out_of_the_folder(
     (tmp_path / "a.yaml").symlink_to(tmp_path.parent / "linked.yaml")
     with pytest.raises(NotImportable, match="allowed: a file in the folder of the imported one"):
         imported("sensors: !include a.yaml")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no named pipes in folders")
+def test_a_named_pipe_is_not_included(imported: Callable[..., Imported], tmp_path: Path) -> None:
+    if sys.platform != "win32":
+        os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(NotImportable, match="it is a named pipe, allowed: a regular file"):
+        imported("sensors: !include pipe")
+
+
+@pytest.mark.parametrize("lost", ["a.yaml", "b.yaml", "secrets.yaml"])
+def test_the_first_file_that_does_not_answer_ends_the_import(
+    imported: Callable[..., Imported], tmp_path: Path, lost: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.yaml").write_text("[!include b.yaml, !include b.yaml]\n")
+    (tmp_path / "b.yaml").write_text("{name: a, address: !secret low}\n")
+    (tmp_path / "secrets.yaml").write_text("low: 1\n")
+    read, asked = bounded_files.read, list[str]()
+
+    def answer(path: Path, *args: Any, **options: Any) -> bytes:
+        asked.append(path.name)
+        if path.name == lost:
+            raise bounded_files.not_answered(str(path), bounded_files.TIMEOUT_MS)
+        return read(path, *args, **options)
+
+    monkeypatch.setattr(bounded_files, "read", answer)
+    with pytest.raises(ConfigNotAnswered):
+        imported("sensors: !include a.yaml")
+    assert asked[-1] == lost
+    assert asked.count(lost) == 1
 
 
 def test_secrets_are_not_read_from_other_folders(tmp_path: Path) -> None:

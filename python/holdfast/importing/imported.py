@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from holdfast.config.dump import to_yaml
 from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
-from holdfast.config.text.problems import ConfigError, Problem
+from holdfast.config.text.problems import ConfigError, ConfigNotAnswered, Problem
 from holdfast.importing.notes import Desk, Note
 
 if TYPE_CHECKING:
@@ -90,6 +90,8 @@ class Source:
             document, found = yaml_document.parse(
                 text, self.file, known if merges else None, merges=merges
             )
+        except ConfigNotAnswered:
+            raise
         except ConfigError as error:
             raise ConfigError(self.file, self._without_secrets(error.problems)) from None
         self.problems = self._without_secrets(found)

@@ -190,10 +190,12 @@ def decoded(data: bytes, file: str, form: str = "YAML") -> str:
         raise _error(file, f"not UTF-8, allowed: {form} in UTF-8", line) from None
 
 
-def read_bytes(path: Path, file: str, max_bytes: int = MAX_BYTES) -> bytes:
+def read_bytes(
+    path: Path, file: str, max_bytes: int = MAX_BYTES, *, named_pipe: bool = True
+) -> bytes:
     """Reads a file without decoding it. Raises `ConfigError`."""
     try:
-        return bounded_files.read(path, max_bytes, named_pipe=True)
+        return bounded_files.read(path, max_bytes, named_pipe=named_pipe)
     except bounded_files.NotAnswered as error:
         raise ConfigNotAnswered.of(error) from None
     except (OSError, ValueError) as error:
@@ -350,6 +352,8 @@ class _Reader:
         try:
             self._events = iter(_events(included.text, included.file, self._left))
             return self._document(path)
+        except ConfigNotAnswered:
+            raise
         except ConfigError as error:
             del self.mistakes[known:]
             for each in error.problems:

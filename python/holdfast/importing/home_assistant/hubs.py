@@ -14,7 +14,7 @@ from urllib.parse import quote, urlencode
 from holdfast.client.url import parse
 from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
-from holdfast.config.text.problems import ConfigError
+from holdfast.config.text.problems import ConfigError, ConfigNotAnswered
 from holdfast.config.values.scalars import MAX_TIME, MIN_TIME
 from holdfast.importing.home_assistant.entities import PLATFORMS, Entities, Places
 from holdfast.importing.home_assistant.write_actions import note_write_actions
@@ -163,10 +163,13 @@ class _Tags:
         if not _real(path).is_relative_to(self._folder):
             raise ValueError(f"found !include {text}, allowed: {_INSIDE}")
         try:
-            content = yaml_document.read_text(path, str(path))
+            content = yaml_document.read_bytes(path, str(path), named_pipe=False)
+            decoded = yaml_document.decoded(content, str(path))
+        except ConfigNotAnswered:
+            raise  # Each further file of a mount that is gone takes as long.
         except ConfigError as error:
             raise ValueError(f"found !include {text}, but {error}") from None
-        return yaml_document.Included(str(path), content)
+        return yaml_document.Included(str(path), decoded)
 
     def _secret(self, name: str, folder: Path) -> Any:
         """The value in the nearest file with secrets, from the folder up, as in the source."""
@@ -188,6 +191,8 @@ class _Tags:
             raise ValueError(f"found a secret, but {file} is a link, allowed: {_INSIDE}")
         try:
             return Source(file, lambda kind, text, _: yaml_document.scalar(text, kind)).desk
+        except ConfigNotAnswered:
+            raise
         except ConfigError:
             raise ValueError(f"found a secret, but {file} is not YAML that can be read") from None
 
