@@ -751,6 +751,14 @@ def test_files_that_include_others_again_and_again_are_refused(
     (tmp_path / "8.yaml").write_text(f"[{'1, ' * 2000}]\n")
     with pytest.raises(ConfigError, match="more than 300000 keys and values, the limit"):
         imported("sensors: !include 0.yaml")
+    (tmp_path / "8.yaml").write_text("\n" * (1 << 20))
+    with pytest.raises(NotImportable) as raised:
+        imported(f"sensors: [{'!include 8.yaml, ' * 5}]")
+    message = (
+        "8: modbus[0].sensors[4]: found !include 8.yaml, allowed: 4194304 bytes in all files "
+        "that are included"
+    )
+    assert message in refusals(raised.value)
 
 
 def test_packages_that_are_not_read_are_noted(imported: Callable[..., Imported]) -> None:

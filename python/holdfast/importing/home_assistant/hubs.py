@@ -63,6 +63,11 @@ _MAX_DEPTH = 3
 _MAX_INCLUDES = 300
 """Maximum number of files that are read because others name them, each time counted."""
 
+_MAX_INCLUDED_BYTES = 4 << 20
+"""Maximum size of these files together, each time counted: comments and empty lines take time and
+memory, too.
+"""
+
 _INSIDE = "a file in the folder of the imported one, or below it"
 
 _PACKAGES = ("homeassistant", "packages")
@@ -142,6 +147,7 @@ class _Tags:
         self._folder = _real(folder)
         self._secrets: dict[Path, Desk | None] = {}
         self._includes_left = _MAX_INCLUDES
+        self._bytes_left = _MAX_INCLUDED_BYTES
 
     def resolve(self, kind: str, text: str, file: str) -> Any:
         if kind == "!include":
@@ -169,6 +175,10 @@ class _Tags:
             raise  # Each further file of a mount that is gone takes as long.
         except ConfigError as error:
             raise ValueError(f"found !include {text}, but {error}") from None
+        self._bytes_left -= len(content)
+        if self._bytes_left < 0:
+            allowed = f"{_MAX_INCLUDED_BYTES} bytes in all files that are included"
+            raise ValueError(f"found !include {text}, allowed: {allowed}")
         return yaml_document.Included(str(path), decoded)
 
     def _secret(self, name: str, folder: Path) -> Any:
