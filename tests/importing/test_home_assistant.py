@@ -933,6 +933,18 @@ def test_the_last_of_equal_keys_counts_as_in_the_source(
     ]
 
 
+def test_equal_keys_inside_a_value_that_does_not_count_have_no_note(
+    imported: Callable[..., Imported],
+) -> None:
+    twice = "sensors: [{name: a, slave: 1, slave: 2, address: 3}]"
+    once = "sensors: [{name: a, slave: 2, address: 3}]"
+    hub = HUB.replace("{entities}", twice) + HUB.partition("\n")[2]
+    last = "the last counts, as in the source"
+    for entities, lines in ((once, [10]), (twice, [10, 15])):
+        found = imported(entities, hub)
+        assert [note.line for note in found.notes if last in note.message] == lines
+
+
 def test_the_last_of_several_merge_keys_counts_as_in_the_source(
     imported: Callable[..., Imported],
 ) -> None:

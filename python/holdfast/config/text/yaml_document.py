@@ -231,7 +231,7 @@ def parse(
         message = f"found {spot.values} values with aliases expanded, allowed: up to {max_values}"
         raise ConfigError(file, [Problem(file, 1, 1, "", message)])
     mistaken = tuple(path for _, path, _ in reader.mistakes)
-    document = Document(file, data, spot, tuple(reader.repeated), mistaken)
+    document = Document(file, data, spot, tuple(filter(None, reader.repeated)), mistaken)
     return document, [
         Problem(place.file, place.line, place.column, document.spell(path), message)
         for place, path, message in reader.mistakes
@@ -276,7 +276,8 @@ class _Reader:
         """The first mistakes inside an anchor, which are also those of its aliases: only a part of
         a file of another program may be read."""
         self.mistakes: list[tuple[Place, KeyPath, str]] = []
-        self.repeated: list[tuple[KeyPath, int]] = []
+        self.repeated: list[tuple[KeyPath, int] | None] = []
+        """The keys that were given before, `None` inside a value that does not count."""
         self._events = iter(_events(text, file, max_written))
         self._left = max_written
         self._anchors: dict[int | str, tuple[Any, _Spot] | None] = {}
@@ -377,6 +378,7 @@ class _Reader:
         spot = _Spot(self._place(start))
         data: dict[Key, Any] = {}
         merged: list[tuple[YamlEvent, Any, _Spot]] = []
+        repeated_in: dict[Key, slice] = {}  # The part of `repeated` that is inside a value.
         for event in self._until_end():
             key = self._key(event, path)
             if key == "<<" and self._merges:
@@ -387,17 +389,21 @@ class _Reader:
                 self._add(event, (*path, key), message)
                 key = None
             elif key in data and self._merges:
+                if (replaced := repeated_in.pop(key, None)) is not None:
+                    self.repeated[replaced] = [None] * (replaced.stop - replaced.start)
                 self.repeated.append(((*path, key), spot.children[key][0].line))
             elif key in data:
                 first = spot.children[key][0].line
                 name = str(key) if isinstance(key, int) else show(key)
                 self._add(event, path, f"{name} is given twice, first in line {first}")
                 key = None
-            known = len(self.mistakes)
+            known, before = len(self.mistakes), len(self.repeated)
             value, child = self._value(next(self._events), path if key is None else (*path, key))
             if key is None:
-                del self.mistakes[known:]
+                del self.mistakes[known:], self.repeated[before:]
                 continue
+            if len(self.repeated) > before:
+                repeated_in[key] = slice(before, len(self.repeated))
             data[key] = value
             spot.children[key] = (self._place(event), child)
             spot.values += child.values
