@@ -6,12 +6,9 @@ from __future__ import annotations
 
 import errno
 import io
-import logging
 import os
 import sys
 from pathlib import Path
-
-from holdfast.events.writer import QueuedHandler
 
 _UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EPIPE)
 
@@ -65,10 +62,3 @@ def leave() -> None:
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.close(nowhere)
-
-
-def announce(text: str) -> None:
-    """Prints what a service says at its start. A service runs, whoever reads that, and when."""
-    printing = QueuedHandler(sys.stdout)
-    printing.emit(logging.makeLogRecord({"msg": text}))
-    printing.flush()  # Whoever reads has it before the service goes on.

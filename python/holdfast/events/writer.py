@@ -121,3 +121,10 @@ class QueuedHandler(logging.Handler):
                 self._ends_in_line = data[:count][-1:] != b"\n"
                 data = data[count:]
         return 0
+
+
+def announce(text: str) -> None:
+    """Prints what a service says at its start. A service runs, whoever reads that, and when."""
+    printing = QueuedHandler(sys.stdout)
+    printing.emit(logging.makeLogRecord({"msg": text}))
+    printing.flush()  # Whoever reads has it before the service goes on.

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast.cli import standard_output, terminal_text
+from holdfast.cli import terminal_text
 from holdfast.cli.exit_codes import fail
 from holdfast.cli.live import schedule
 from holdfast.cli.options.bind_and_source import (
@@ -28,6 +28,7 @@ from holdfast.cli.options.option import FILE, file_option, option, parsed_by
 from holdfast.cli.shell_command import shell_command
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.tags.files import tags_of
+from holdfast.events.writer import announce
 from holdfast.net.addresses import LOOPBACK, joined, reachable
 from holdfast.runtime.text import suggestion
 from holdfast.server import Server
@@ -131,7 +132,7 @@ def simulate(
             where = _serve(running, simulated, bind, unit, sources or LOOPBACK, faults, seed)
         except OSError as error:
             fail(f"{unbindable(bind, error)}; --bind sets another address or port")
-        standard_output.announce(_greeting(file, profile, tags, where, unit))
+        announce(_greeting(file, profile, tags, where, unit))
 
         def wait(seconds: float) -> None:
             if signals.received:

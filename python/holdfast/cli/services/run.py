@@ -18,7 +18,6 @@ from holdfast.appliance import Appliance
 from holdfast.appliance.control import Control
 from holdfast.appliance.parts.shared_logs import LogNotJoined
 from holdfast.appliance.service_manager import ServiceManager
-from holdfast.cli import standard_output
 from holdfast.cli.configuration import load_or_exit, load_whole
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import config_argument
@@ -33,6 +32,7 @@ from holdfast.config.models.services import GatewayConfig
 from holdfast.config.unit_rights import unit_rights
 from holdfast.config.values.scanner_settings import written_pollable
 from holdfast.events import log_lines
+from holdfast.events.writer import announce
 from holdfast.net.addresses import joined, reachable
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.runtime.bounded_files import Unreadable
@@ -141,7 +141,7 @@ def serve(
         if reloading is not None and file is not None:
             parts.callback(_control(appliance, reloading, file))
         spare_what_stays()
-        standard_output.announce(greeting(appliance))
+        announce(greeting(appliance))
         manager.ready()
         while not signals.received:
             appliance.log_events(timeout=SIGNAL_INTERVAL_S)

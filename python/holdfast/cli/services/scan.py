@@ -12,7 +12,6 @@ from urllib.parse import urlsplit
 import click
 
 from holdfast import __version__
-from holdfast.cli import standard_output
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.old_spellings import hint
 from holdfast.cli.options.duration import Duration, time_option, timeout_option
@@ -55,6 +54,7 @@ from holdfast.config.values.scanner_settings import (
     parse_prefix,
 )
 from holdfast.events import log_lines
+from holdfast.events.writer import announce
 from holdfast.net import event_loop
 from holdfast.net.allow_list import AllowedNetwork
 from holdfast.net.nats.connection import Ping, Servers
@@ -166,7 +166,7 @@ def scan(
                 server = stack.enter_context(TemporaryServer(_embedded_port(servers), store))
                 servers, check = Servers((server.url,)), server.check
             settings = _settings(options, servers, allow, limits, device_tls)
-            standard_output.announce(_greeting(settings))
+            announce(_greeting(settings))
             event_loop.run(_serve(settings, check))
         except FleetRefused as refused:
             fail(f"fleet {options['fleet']}: {refused}", ExitCode.WRONG)
