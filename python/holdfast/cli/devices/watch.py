@@ -179,7 +179,7 @@ def _device(
 def _parts(client: SyncClient, found: AreaMap, extent: range) -> list[Probe]:
     """A range, in parts that the device returns, if it takes less at once than the standard.
 
-    What it refuses meanwhile is left out, which is told. Other errors may pass: the first reading
+    What it refuses meanwhile is left out, and named. Other errors may pass: the first reading
     decides.
     """
     blocks = [
