@@ -76,6 +76,20 @@ def test_what_is_taken_stays_until_it_is_done() -> None:
     assert (len(buffer), drained(buffer)) == (2, [3, 4])
 
 
+def test_the_output_before_a_reload_gets_nothing_that_is_meant_for_the_next_one() -> None:
+    before = Buffer(3)
+    before.offer(polls(4))
+    after = Buffer(before=Buffer(before=before))
+    after.offer([[reading(9)]])
+    assert numbers(before.take(1, 0.0)) == [1]
+    assert numbers(before.take(10, 0.0)) == [1]
+    assert len(after) == 4
+    before.detach()
+    after.take_over()
+    assert (len(before), len(after), after.dropped) == (0, 4, 1)
+    assert numbers(after.take(10, 0.0)) == [1, 2, 3, 9]
+
+
 def test_a_wait_can_be_ended() -> None:
     buffer = Buffer()
     began = time.monotonic()

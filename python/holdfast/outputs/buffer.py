@@ -34,10 +34,12 @@ class Buffer:
     What is taken or stored ends with a whole poll, so that nobody sees half of one.
     """
 
-    def __init__(self, most: int = MAX_VALUES) -> None:
+    def __init__(self, most: int = MAX_VALUES, before: Buffer | None = None) -> None:
+        """`before` is that of the same output with other settings, until a reload."""
         self.most = most
-        self.in_use = threading.Lock()
+        self.in_use: threading.Lock = threading.Lock() if before is None else before.in_use
         """Held by the output that sends: after a reload, the one before may still be ending."""
+        self._before = before
         self._waiting: deque[Sequence[Reading]] = deque()
         """Polls."""
         self._count = 0
@@ -49,8 +51,9 @@ class Buffer:
         self._changed = threading.Condition()
         self._is_woken = False
         self.stored: Stored | None = None
-        self.dropped = 0
+        self.dropped: int = 0 if before is None else before.dropped
         """Readings that were lost because there was no room."""
+        self._dropped_before = self.dropped
 
     def offer(self, polls: Iterable[Sequence[Reading]]) -> None:
         """Adds the readings of polls. If there is no room, the oldest are dropped and counted."""
@@ -70,6 +73,25 @@ class Buffer:
                 self._drop(gone)
             self._changed.notify_all()
 
+    def take_over(self) -> None:
+        """Takes what the output before the reload has left. Called with `in_use`: that has ended.
+
+        Until then, it sends nothing that is meant for this one: a broker or topic of before would
+        get it in place of the new one.
+        """
+        before, self._before = self._before, None
+        if before is not None:
+            before.take_over()
+            self._put_back(*before._pop_all())
+            self._drop(before.dropped - self._dropped_before)
+
+    def _pop_all(self) -> list[Sequence[Reading]]:
+        with self._changed:
+            polls = [*self._waiting]
+            self._waiting.clear()
+            self._count = 0
+            return polls
+
     def _drop(self, count: int) -> None:
         # Both threads count.
         with self._changed:
@@ -77,10 +99,11 @@ class Buffer:
 
     def __len__(self) -> int:
         # Diagnostics ask too, while the thread of the output may lose the file.
-        stored = self.stored
+        stored, before = self.stored, self._before
         with self._changed:
             waiting = self._count + (0 if self._is_batch_stored else len(self._batch))
-            return waiting + (0 if stored is None else stored.count)
+        waiting += 0 if stored is None else stored.count
+        return waiting + (0 if before is None else len(before))
 
     def take(self, max_readings: int, timeout: float) -> list[Reading]:
         """Returns the oldest readings. Waits for the first up to `timeout` seconds.
@@ -198,7 +221,7 @@ class Buffer:
             self.stored, self._is_batch_stored = None, False
             raise
 
-    def _put_back(self, *rows: list[Reading]) -> None:
+    def _put_back(self, *rows: Sequence[Reading]) -> None:
         with self._changed:
             self._waiting.extendleft(row for row in reversed(rows) if row)
             self._count += sum(map(len, rows))

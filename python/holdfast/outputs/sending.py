@@ -130,6 +130,7 @@ class Sending:
                 return
         self._is_failing, self._last_error = False, None
         try:
+            self._buffer.take_over()
             self._run(stop)
         finally:
             self._buffer.in_use.release()

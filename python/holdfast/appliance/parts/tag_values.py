@@ -185,7 +185,7 @@ class TagValues:
             for name, settings in config.outputs.items():
                 known = self._outputs.get(name)
                 if known is None or known.settings != settings:
-                    buffer = Buffer() if known is None else known.buffer
+                    buffer = Buffer(before=None if known is None else known.buffer)
                     changes = Changes(settings.publish, settings.heartbeat)
                     known = _Output(settings, changes, buffer)
                 known.buffer.most = settings.buffer.values
