@@ -230,13 +230,13 @@ def test_a_client_that_shows_its_bytes_to_its_owner_ends_with_it() -> None:
 @pytest.mark.parametrize("scheme", ["tcp", "rtu+tcp"])
 def test_a_client_for_asyncio_that_shows_its_bytes_to_its_owner_ends_with_it(scheme: str) -> None:
     def forget(owners: list[Owner], warned: pytest.WarningsRecorder) -> None:
-        def is_told() -> bool:
+        def is_warned_of() -> bool:
             gc.collect()
             return bool(warned.list)
 
         owners.clear()
         # A thread may still be at the end of the call.
-        wire.until(is_told, "it is told")
+        wire.until(is_warned_of, "Python warns of it")
 
     async def main(device: Stream) -> None:
         owners = [Owner(holdfast.Client, device.url)]

@@ -79,7 +79,7 @@ class Control:
         """Frees the sockets."""
         self._closed.set()
         for address in self._listeners:
-            _is_alive(address)  # Wakes the thread. So do callers that it has not accepted yet.
+            _is_alive(address)  # Connecting wakes the thread, as callers do that still wait for it.
         for thread in self._threads:
             thread.join(TIMEOUT_S)
         for listener in self._listeners.values():
@@ -193,7 +193,7 @@ def _listen(address: str) -> Listener:
 def _is_alive(address: str) -> bool:
     """Connects, without waiting. Returns whether somebody listens there."""
     if sys.platform == "win32":
-        with contextlib.suppress(OSError), Client(address):
+        with contextlib.suppress(OSError, EOFError), Client(address):
             return True
         return False
     try:

@@ -476,8 +476,8 @@ impl OneAtATime {
         }
     }
 
-    /// Whether the bytes after a reply that is doubted may be another one, whole, damaged or in part. A line has
-    /// noise, and some devices pad replies: these are shorter, or begin like none.
+    /// Whether the bytes after a reply that is doubted may be another one, whole, damaged or in part. A serial line has
+    /// noise, which a stream has not, and some devices pad replies: both are shorter, or begin like none.
     fn may_be_other_reply(&self, flights: &Flights) -> bool {
         let (bytes, pads) = (&self.received, flights.tolerance.pad);
         let len = self.doubted.as_ref().map_or(0, |(_, pdu, _)| self.reply_len(pdu.len()));

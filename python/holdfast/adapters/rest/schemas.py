@@ -94,7 +94,7 @@ _LINK = object_of(
         "failures": count("No connection, a lost connection, or an invalid reply"),
         "refused_full": COUNT,
         "refused_down": COUNT,
-        "coalesced": count("Answered by an identical read"),
+        "coalesced": count("Ended with an identical read, answered or not"),
         "cached": count("Answered by an earlier reply"),
         "withdrawn": count("Not sent: the client had gone, or after a standstill"),
         "waiting": COUNT,

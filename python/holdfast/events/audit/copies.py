@@ -55,7 +55,7 @@ class Copies:
         self._waiting: deque[bytes] = deque()
         self._size = 0
         self._sent = self._failed = self._dropped = 0
-        self._told, self._told_at = 0, -inf
+        self._logged, self._logged_at = 0, -inf
         """The dropped lines that were logged, and when."""
         self._closing = False
         self._error: str | None = None
@@ -100,7 +100,7 @@ class Copies:
         with self._change:
             self._dropped += len(self._waiting)
             self._waiting.clear()
-        self._tell_lost(0.0)
+        self._log_lost(0.0)
 
     def _run(self) -> None:
         while (line := self._next()) is not None:
@@ -129,7 +129,7 @@ class Copies:
             self._failed += error is not None and not too_long
             self._sent += error is None
             self._dropped += too_long
-            self._told += too_long
+            self._logged += too_long
             if (error is None or too_long) and self._waiting:
                 self._size -= len(self._waiting.popleft())
         if error is not None:
@@ -142,13 +142,13 @@ class Copies:
         elif self._error is not None and time.monotonic() >= self._failed_at + BACK_AFTER_S:
             self._error = None
             log_lines.write(logging.INFO, "audit_copies_back", receiver=self.name)
-        self._tell_lost(LOST_INTERVAL_S)
+        self._log_lost(LOST_INTERVAL_S)
 
-    def _tell_lost(self, every: float) -> None:
+    def _log_lost(self, every: float) -> None:
         """Logs how many lines were dropped, once in some seconds."""
         with self._change:
-            lost, now = self._dropped - self._told, time.monotonic()
-            if not lost or now < self._told_at + every:
+            lost, now = self._dropped - self._logged, time.monotonic()
+            if not lost or now < self._logged_at + every:
                 return
-            self._told, self._told_at = self._dropped, now
+            self._logged, self._logged_at = self._dropped, now
         log_lines.write(logging.ERROR, "audit_copies_lost", receiver=self.name, count=lost)
