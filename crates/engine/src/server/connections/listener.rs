@@ -98,28 +98,38 @@ impl ListenerContext {
         self.auditor.as_ref().map_or_else(|| Some(Permit::default()), ask)
     }
 
-    pub(crate) fn report(&self, kind: Kind, peer: Option<Peer>) {
-        self.reporter.report(&self.name, kind, peer, None);
+    /// Counts and reports a connection that has ended, or was refused.
+    pub(crate) fn ended(&self, kind: Kind, peer: impl Into<Peer>) {
+        self.report(kind, Some(peer.into()));
     }
 
-    /// Counts and reports the end of a connection.
-    pub(crate) fn ended(&self, kind: Kind, peer: impl Into<Peer>) {
-        self.ended_with(kind, peer, None);
+    /// Counts what has happened, if there is a counter for it, and reports it.
+    pub(crate) fn report(&self, kind: Kind, peer: Option<Peer>) {
+        self.report_with(kind, peer, None);
     }
 
     /// The same, for a peer that has presented a certificate.
-    pub(crate) fn ended_with(&self, kind: Kind, peer: impl Into<Peer>, subject: Option<&str>) {
+    pub(crate) fn report_with(&self, kind: Kind, peer: Option<Peer>, subject: Option<&str>) {
+        let counters = &self.connections;
         match kind {
-            Kind::Idle => self.connections.idle.add(),
-            Kind::RightsRevoked => self.connections.rights_revoked.add(),
-            Kind::Ended => self.connections.ended.add(),
-            Kind::RequestTimeout => self.connections.request_timeout.add(),
-            Kind::SlowReader => self.connections.slow_reader.add(),
-            Kind::BrokenRequest => self.connections.broken_request.add(),
-            Kind::TlsFailed(reason) => self.connections.tls_failed.add(reason),
+            Kind::Opened => counters.accepted.add(),
+            Kind::RefusedSource => counters.refused_source.add(),
+            Kind::RefusedRole => counters.refused_role.add(),
+            Kind::RefusedFull => counters.refused_full.add(),
+            Kind::RefusedListenOnly => counters.refused_listen_only.add(),
+            Kind::Evicted => counters.evicted.add(),
+            Kind::EvictedHandshake => counters.evicted_handshakes.add(),
+            Kind::RightsRevoked => counters.rights_revoked.add(),
+            Kind::Ended => counters.ended.add(),
+            Kind::Idle => counters.idle.add(),
+            Kind::RequestTimeout => counters.request_timeout.add(),
+            Kind::SlowReader => counters.slow_reader.add(),
+            Kind::AcceptError(_) => counters.accept_errors.add(),
+            Kind::TlsFailed(reason) => counters.tls_failed.add(reason),
+            Kind::BrokenRequest => counters.broken_request.add(),
             _ => {}
         }
-        self.reporter.report(&self.name, kind, Some(peer.into()), subject);
+        self.reporter.report(&self.name, kind, peer, subject);
     }
 
     /// Ends the connections that a service does not serve any more in the place of `before`.
@@ -153,26 +163,10 @@ impl ListenerContext {
     pub(crate) fn evicted(&self, evicted: Option<Evicted>) {
         match evicted {
             None => {}
-            Some(Evicted::Connection(peer)) => {
-                self.connections.evicted.add();
-                self.report(Kind::Evicted, Some(peer));
-            }
-            Some(Evicted::Handshake(peer)) => {
-                self.connections.evicted_handshakes.add();
-                self.report(Kind::EvictedHandshake, Some(peer));
-            }
+            Some(Evicted::Connection(peer)) => self.ended(Kind::Evicted, peer),
+            Some(Evicted::Handshake(peer)) => self.ended(Kind::EvictedHandshake, peer),
             Some(Evicted::Answered(peer)) => self.ended(Kind::Closed, peer),
         }
-    }
-
-    pub(crate) fn refuse_full(&self, peer: impl Into<Peer>) {
-        self.connections.refused_full.add();
-        self.report(Kind::RefusedFull, Some(peer.into()));
-    }
-
-    pub(crate) fn refuse_source(&self, peer: SocketAddr) {
-        self.connections.refused_source.add();
-        self.report(Kind::RefusedSource, Some(peer.into()));
     }
 
     /// Answers a request from a memory: permits it, and records it if it writes. Returns the length of the
@@ -188,7 +182,6 @@ impl ListenerContext {
     ) -> (Option<usize>, Option<RefusedRequest>) {
         let is_for_listen_only = unit_server.listen_only.refuses(request);
         if is_for_listen_only {
-            self.connections.refused_listen_only.add();
             self.report(Kind::RefusedListenOnly, peer.cloned());
         }
         let mut permit = None;
@@ -241,11 +234,6 @@ impl ListenerContext {
         {
             self.report(Kind::RefusedRequest(refused), peer.cloned());
         }
-    }
-
-    pub(crate) fn refuse_role(&self, peer: Peer) {
-        self.connections.refused_role.add();
-        self.report(Kind::RefusedRole, Some(peer));
     }
 }
 
@@ -312,7 +300,6 @@ pub(crate) async fn accept<S: Service>(
             Ok((stream, peer)) => admit(&context, &service, stream, peer, &workers, &stop),
             Err(error) if is_of_one_peer(&error) => {}
             Err(error) => {
-                context.connections.accept_errors.add();
                 context.report(Kind::AcceptError(error.raw_os_error()), None);
                 tokio::time::sleep(ACCEPT_PAUSE).await;
             }
@@ -330,21 +317,20 @@ fn admit<S: Service>(
     stop: &watch::Receiver<bool>,
 ) {
     if live.get().rights(peer.ip()).is_none() {
-        return context.refuse_source(peer);
+        return context.ended(Kind::RefusedSource, peer);
     }
     let (ticket, evicted) = match context.admission.admit(peer) {
         Ok(admitted) => admitted,
         // A reload has just removed the listener.
         Err(Full) if context.admission.is_closed() => return,
-        Err(Full) => return context.refuse_full(peer),
+        Err(Full) => return context.ended(Kind::RefusedFull, peer),
     };
     context.evicted(evicted);
-    context.connections.accepted.add();
     context.report(Kind::Opened, Some(peer.into()));
     // A reload reviews the admitted connections. This one looks up its rights only now.
     let service = live.get();
     let Some(rights) = service.rights(peer.ip()) else {
-        return context.refuse_source(peer);
+        return context.ended(Kind::RefusedSource, peer);
     };
     let id = ticket.id();
     let connection = Admitted { stream, peer, rights, received: Vec::new(), ticket };

@@ -59,7 +59,8 @@ pub(crate) async fn secured(
         let certificate = match certificate {
             Ok(certificate) => certificate.map(Arc::new),
             Err(end) => {
-                context.ended_with(end, peer, stream.channel.presented_subject().as_deref());
+                let subject = stream.channel.presented_subject();
+                context.report_with(end, Some(peer.into()), subject.as_deref());
                 drain(&mut stream.into_socket(), stop, |_| ()).await;
                 return None;
             }
@@ -71,7 +72,7 @@ pub(crate) async fn secured(
         match ticket.establish() {
             Ok(evicted) => context.evicted(evicted),
             Err(Full) => {
-                context.refuse_full(peer);
+                context.ended(Kind::RefusedFull, peer);
                 stream.refuse(stop).await;
                 return None;
             }

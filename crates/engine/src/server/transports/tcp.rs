@@ -140,7 +140,7 @@ impl ModbusStream {
         }
         // A reload reviews connections by their roles. This one looks up its rights only now.
         let rights = live.get().policy.by_certificate(&peer).unwrap_or_else(|nobody| {
-            context.refuse_role(peer.clone());
+            context.report(Kind::RefusedRole, Some(peer.clone()));
             nobody
         });
         self.modbus::<F, _>(live, context, (stream, peer), (rights, Vec::new()), ticket, stop)

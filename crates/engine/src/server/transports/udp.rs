@@ -22,6 +22,7 @@ use crate::server::connections::deadlines::BURST_TIME;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected, MAX_WAITING};
+use crate::server::reports::event::Kind;
 use crate::server::reports::refused_request::Reported;
 use crate::server::requests::unit_server::{UnitServer, UnitSettings};
 use crate::server::rights::functions::only_reads;
@@ -174,7 +175,7 @@ impl ModbusUdp {
     ) -> usize {
         let peer = meta.addr;
         let Some(rights) = self.policy.get().rights(peer.ip(), None) else {
-            context.refuse_source(peer);
+            context.report(Kind::RefusedSource, Some(peer.into()));
             return 0;
         };
         let (tag, unit_id, request) = match D::only(datagram) {
