@@ -350,10 +350,7 @@ impl RawIngest {
         if !rights.areas.contains(&area) {
             return Err(Refusal::NotGranted);
         }
-        let span = memory.span(area);
-        let (start, end) = (u32::from(span.start()), u32::from(span.start()) + span.size());
-        let address = u32::from(header.address);
-        if address < start || address + u32::from(header.count.get()) > end {
+        if !memory.span(area).holds(header.address, header.count.get().into()) {
             return Err(Refusal::Range);
         }
         match self.format.packet_len(&header).checked_sub(bytes.len()) {
