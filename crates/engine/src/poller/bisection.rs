@@ -75,12 +75,12 @@ async fn divide(
     parts: &mut Vec<Part>,
 ) -> Result<(), Fault> {
     let Some(halves) = plan::halves(&device.fields, block) else {
-        gathered.note(block, Err(fault));
+        gathered.note(block.range(), Err(fault));
         parts.push(Part { block: block.clone(), refused: Some(fault) });
         return Ok(());
     };
     for half in halves {
-        match device.ask(&half).await {
+        match device.ask(half.range()).await {
             Ok(bytes) => {
                 device.take(&half, bytes, gathered);
                 parts.push(Part { block: half, refused: None });
@@ -89,7 +89,7 @@ async fn divide(
                 Box::pin(divide(device, gathered, &half, fault, parts)).await?;
             }
             Err(other) => {
-                gathered.note(&half, Err(other));
+                gathered.note(half.range(), Err(other));
                 return Err(other);
             }
         }
@@ -113,7 +113,7 @@ async fn join(device: &Device, refused: &Block, run: &[Part]) -> Result<(), Faul
     for Part { block, .. } in others {
         let joined = plan::joined(&device.fields, &whole, block);
         let together = (joined.address, joined.count) != (refused.address, refused.count)
-            && match device.ask(&joined).await {
+            && match device.ask(joined.range()).await {
                 Ok(_) => true,
                 Err(fault) if fault.is_illegal() => false,
                 Err(other) => {

@@ -517,9 +517,8 @@ impl Device {
     /// A poll without a plan: nothing is sent, and every field gets the fault.
     fn leave_out(&self, due: Instant, mut gathered: Gathered) {
         self.state.counters.unplanned.add();
-        for Field { area, address, count } in self.fields.iter().copied() {
-            let block = Block { area, address, count, fields: Vec::new(), gaps: 0 };
-            gathered.note(&block, Err(Fault::Unplanned));
+        for field in &self.fields {
+            gathered.note(*field, Err(Fault::Unplanned));
         }
         self.state.bad(Fault::Unplanned);
         self.hand_over(due, gathered);
@@ -543,29 +542,27 @@ impl Device {
         let only = self.plan.borrow().as_ref().is_none_or(|plan| plan.is_empty());
         let retried = self.learned().retry(Instant::now(), only);
         let mut fault = None;
-        for range in known {
-            let block = range.block();
-            let mut found = range.fault;
-            if retried.as_ref().is_some_and(|retried| retried.is(range)) {
-                match self.ask(&block).await {
+        for &Unreadable { range, fault: mut found, .. } in known {
+            if retried == Some(range) {
+                match self.ask(range).await {
                     Err(fault) => found = fault,
                     Ok(bytes) => {
                         // The next poll reads it with others.
-                        gathered.note(&block, Ok(bytes));
+                        gathered.note(range, Ok(bytes));
                         *self.learned() = Learned::default();
                         self.draw_plan();
                         continue;
                     }
                 }
             }
-            gathered.note(&block, Err(found));
+            gathered.note(range, Err(found));
             fault = Some(found);
         }
         fault
     }
 
     async fn read(&self, block: &Block, gathered: &mut Gathered) -> Result<(), Fault> {
-        match self.ask(block).await {
+        match self.ask(block.range()).await {
             Ok(bytes) => {
                 self.take(block, bytes, gathered);
                 Ok(())
@@ -575,7 +572,7 @@ impl Device {
                 self.search(gathered, block, fault).await
             }
             Err(other) => {
-                gathered.note(block, Err(other));
+                gathered.note(block.range(), Err(other));
                 Err(other)
             }
         }
@@ -584,12 +581,12 @@ impl Device {
     /// Passes on the bytes of a block.
     pub(super) fn take(&self, block: &Block, bytes: Vec<u8>, gathered: &mut Gathered) {
         self.spread(block, &bytes, gathered);
-        gathered.note(block, Ok(bytes));
+        gathered.note(block.range(), Ok(bytes));
     }
 
-    pub(super) async fn ask(&self, block: &Block) -> Result<Vec<u8>, Fault> {
-        let (address, quantity) = (block.address, block.count);
-        let request = match block.area {
+    pub(super) async fn ask(&self, range: Field) -> Result<Vec<u8>, Fault> {
+        let Field { area, address, count: quantity } = range;
+        let request = match area {
             Area::Coils => Range::new(address, quantity).map(Request::ReadCoils),
             Area::DiscreteInputs => Range::new(address, quantity).map(Request::ReadDiscreteInputs),
             Area::HoldingRegisters => {
@@ -609,7 +606,7 @@ impl Device {
         let DeviceSettings { unit_id, timeout, .. } = &self.settings;
         let fence = self.settings.fence.as_ref();
         let permit = Permit { fence: fence.cloned(), ..Permit::default() };
-        let len = block.area.byte_len(block.count.into());
+        let len = area.byte_len(quantity.into());
         let answer = self.link.call(*unit_id, &request, *timeout, priority, &permit).await;
         // A broadcast has no reply, and so no values.
         let invalid = || ClientError::Invalid(InvalidResponse::Pdu(ResponseError::Length)).into();
@@ -630,8 +627,8 @@ impl Device {
                 let took = began.elapsed();
                 self.state.answered(took);
                 let mut samples = self.samples.get();
-                let bits = if block.area.is_bits() { 16.0 } else { 1.0 };
-                samples.add(f64::from(block.count) / bits, took.as_secs_f64() * 1e3);
+                let bits = if area.is_bits() { 16.0 } else { 1.0 };
+                samples.add(f64::from(quantity) / bits, took.as_secs_f64() * 1e3);
                 self.samples.set(samples);
             }
             Err(Fault::Exception(_)) => counters.exceptions.add(),
@@ -763,9 +760,9 @@ struct Partial {
 }
 
 impl Gathered {
-    pub(super) fn note(&mut self, block: &Block, outcome: Result<Vec<u8>, Fault>) {
+    pub(super) fn note(&mut self, range: Field, outcome: Result<Vec<u8>, Fault>) {
         if self.report {
-            let Block { area, address, count, .. } = *block;
+            let Field { area, address, count } = range;
             let time = SystemTime::now();
             self.blocks.push(BlockResult { area, address, count, outcome, time });
         }

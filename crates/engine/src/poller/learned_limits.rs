@@ -28,32 +28,10 @@ pub(super) struct Learned {
 /// A range that the device refuses to read.
 #[derive(Debug, Clone)]
 pub(super) struct Unreadable {
-    pub(super) area: Area,
-    pub(super) address: u16,
-    pub(super) count: u16,
+    /// Fields inside it may be readable.
+    pub(super) range: Field,
     pub(super) fault: Fault,
     retry_at: Instant,
-}
-
-impl Unreadable {
-    fn end(&self) -> u32 {
-        u32::from(self.address) + u32::from(self.count)
-    }
-
-    /// The range as a request.
-    pub(super) fn block(&self) -> Block {
-        let Unreadable { area, address, count, .. } = *self;
-        Block { area, address, count, fields: Vec::new(), gaps: 0 }
-    }
-
-    pub(super) fn is(&self, other: &Unreadable) -> bool {
-        (self.area, self.address, self.count) == (other.area, other.address, other.count)
-    }
-
-    /// Whether it is the range of this field. A field inside it may be readable.
-    fn is_of(&self, field: &Field) -> bool {
-        *field == Field { area: self.area, address: self.address, count: self.count }
-    }
 }
 
 impl Learned {
@@ -85,22 +63,18 @@ impl Learned {
 
     /// The device refuses this block. Replaces what is known about an equal one.
     pub(super) fn refused(&mut self, block: &Block, fault: Fault) {
-        let Block { area, address, count, .. } = *block;
-        debug_assert!(count > 0);
-        let retry_at = Instant::now() + RETRY_INTERVAL;
-        let range = Unreadable { area, address, count, fault, retry_at };
-        self.unreadable.retain(|known| !known.is(&range));
-        self.unreadable.push(range);
+        let (range, retry_at) = (block.range(), Instant::now() + RETRY_INTERVAL);
+        debug_assert!(range.count > 0);
+        self.unreadable.retain(|known| known.range != range);
+        self.unreadable.push(Unreadable { range, fault, retry_at });
         self.remember();
     }
 
     /// Forgets unreadable ranges without a field. Each leaves a cut at its start.
     pub(super) fn keep(&mut self, fields: &[Field]) {
-        let wanted = |range: &Unreadable| fields.iter().any(|field| range.is_of(field));
-        let (kept, unwanted) = std::mem::take(&mut self.unreadable).into_iter().partition(wanted);
-        self.unreadable = kept;
-        let unwanted: Vec<Unreadable> = unwanted;
-        for range in unwanted {
+        let is_unwanted = |known: &mut Unreadable| !fields.contains(&known.range);
+        let unwanted: Vec<_> = self.unreadable.extract_if(.., is_unwanted).collect();
+        for Unreadable { range, .. } in unwanted {
             self.cut(range.area, range.address.into());
         }
     }
@@ -111,18 +85,18 @@ impl Learned {
 
     /// The range that has waited longest for its next attempt, if that is due or `in_any_case` is
     /// set.
-    pub(super) fn retry(&mut self, now: Instant, in_any_case: bool) -> Option<Unreadable> {
-        let range = self.unreadable.iter_mut().min_by_key(|range| range.retry_at)?;
-        if range.retry_at > now && !in_any_case {
+    pub(super) fn retry(&mut self, now: Instant, in_any_case: bool) -> Option<Field> {
+        let known = self.unreadable.iter_mut().min_by_key(|known| known.retry_at)?;
+        if known.retry_at > now && !in_any_case {
             return None;
         }
-        range.retry_at = now + RETRY_INTERVAL;
-        Some(range.clone())
+        known.retry_at = now + RETRY_INTERVAL;
+        Some(known.range)
     }
 
     /// Whether a field is known to be unreadable.
     pub(super) fn is_refused(&self, field: &Field) -> bool {
-        self.unreadable.iter().any(|range| range.is_of(field))
+        self.unreadable.iter().any(|known| known.range == *field)
     }
 
     /// The limits for requests that read these fields. They never make a field unreadable.
@@ -138,7 +112,7 @@ impl Learned {
         limits.max_registers = within(self.max_registers, of.max_registers, false);
         limits.max_bits = within(self.max_bits, of.max_bits, true);
         limits.cuts.extend(&self.cuts);
-        for range in &self.unreadable {
+        for Unreadable { range, .. } in &self.unreadable {
             let ends = [range.address.into(), range.end()];
             limits.cuts.extend(ends.map(|address| Cut { area: range.area, address }));
         }
@@ -164,7 +138,7 @@ mod tests {
         for (address, code) in [(7, 2), (8, 2), (7, 3)] {
             learned.refused(&block(address), Fault::Exception(code));
         }
-        let known = learned.unreadable().iter().map(|range| (range.address, range.fault));
+        let known = learned.unreadable().iter().map(|known| (known.range.address, known.fault));
         let expected = [(8, Fault::Exception(2)), (7, Fault::Exception(3))];
         assert_eq!(known.collect::<Vec<_>>(), expected);
     }

@@ -108,8 +108,13 @@ impl Block {
         usize::from(field.address - self.address)
     }
 
+    /// The range that it reads.
+    pub(super) fn range(&self) -> Field {
+        Field { area: self.area, address: self.address, count: self.count }
+    }
+
     fn end(&self) -> u32 {
-        u32::from(self.address) + u32::from(self.count)
+        self.range().end()
     }
 }
 
@@ -152,7 +157,7 @@ impl PlanLimits {
 }
 
 impl Field {
-    fn end(&self) -> u32 {
+    pub(super) fn end(&self) -> u32 {
         u32::from(self.address) + u32::from(self.count)
     }
 }
