@@ -16,7 +16,7 @@ use holdfast_protocol::pdu::limit;
 use holdfast_runtime::Retry;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
-use pyo3::types::{PyBytes, PyDict};
+use pyo3::types::{IntoPyDict, PyBytes, PyDict};
 
 use crate::arguments::{byte, packet_format, seconds, within};
 use crate::client::{Endpoint, Request};
@@ -227,11 +227,7 @@ impl Poller {
             let counted = state(py, &device.state)?;
             let mut forwards = Vec::new();
             for forward in &device.forwards {
-                let counters = PyDict::new(py);
-                counters.set_item("sent", forward.sent.get())?;
-                counters.set_item("refused", forward.refused.get())?;
-                counters.set_item("failed", forward.failed.get())?;
-                counters.set_item("replaced", forward.replaced.get())?;
+                let counters = forward.by_name().into_py_dict(py)?;
                 let failure = forward.failure();
                 let reason = failure.as_ref().and_then(|failure| failure.reason);
                 counters.set_item("reason", reason)?;

@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use holdfast_memory::Area;
 use holdfast_protocol::raw_ingest::{DONE, Format, Header};
-use holdfast_runtime::{Counter, Retry, lock};
+use holdfast_runtime::{Retry, lock};
 use socket2::SockRef;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -19,6 +19,7 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, timeout_at};
 
 use super::status::{BlockSettings, STATUS_BLOCK_LEN, Status};
+use crate::counter::counters;
 use crate::link::{Fence, agree, dial};
 use crate::name_lookup;
 use crate::raw_ingest_areas::in_packet;
@@ -68,17 +69,19 @@ enum Content {
     Status,
 }
 
-/// Counters of forwarded packets.
-#[derive(Debug, Default)]
-pub struct ForwardCounters {
-    pub sent: Counter,
-    /// The receiver did not write the packet.
-    pub refused: Counter,
-    /// Connecting failed, or no reply arrived.
-    pub failed: Counter,
-    /// Packets replaced by newer bytes of the same read before they were sent.
-    pub replaced: Counter,
-    failure: Mutex<Option<ForwardFailure>>,
+counters! {
+    /// Counters of forwarded packets.
+    pub struct ForwardCounters {
+        sent,
+        /// The receiver did not write the packet.
+        refused,
+        /// Connecting failed, or no reply arrived.
+        failed,
+        /// Packets replaced by newer bytes of the same read before they were sent.
+        replaced,
+        ;
+        failure: Mutex<Option<ForwardFailure>>,
+    }
 }
 
 /// Why a packet was not confirmed.
