@@ -283,14 +283,9 @@ impl Record {
             }
             _ => false,
         };
-        is_same_reason
-            && self.listener == other.listener
-            && match (&self.peer, &other.peer) {
-                (Some(peer), Some(other)) => {
-                    peer.ip() == other.ip() && peer.certificate == other.certificate
-                }
-                (peer, other) => peer.is_none() && other.is_none(),
-            }
+        let [peer, other_peer] =
+            [self, other].map(|each| each.peer.as_ref().map(|peer| (peer.ip(), &peer.certificate)));
+        is_same_reason && self.listener == other.listener && peer == other_peer
     }
 }
 
