@@ -166,7 +166,7 @@ pub(super) async fn converse(
                 }
                 let mut line = shared.lock();
                 match line.poll_fill(context) {
-                    Poll::Ready(Ok(0)) if line.is_used() => return Poll::Ready(End::Idle),
+                    Poll::Ready(Ok(0)) if line.is_used => return Poll::Ready(End::Idle),
                     Poll::Ready(Ok(0) | Err(_)) => return Poll::Ready(End::Dropped),
                     Poll::Ready(Ok(_)) => serving = Some(Box::pin(begun())),
                     Poll::Pending => return line.poll_deadlines(context, alarm.as_mut()),
@@ -291,7 +291,8 @@ async fn handled(
             upload.is_over = true;
             Some(Bytes::new())
         }
-        Some(_) if has_body => upload.whole().await,
+        // It has arrived with the header, unless the connection breaks.
+        Some(_) if has_body => upload.receive(usize::MAX).await.ok(),
         _ => None,
     };
     let head = Box::new(RequestHead { parts, peer, len });
@@ -357,11 +358,6 @@ enum NoBody {
 }
 
 impl Upload {
-    /// The body, which has arrived with the header. `None` if the connection breaks.
-    async fn whole(&mut self) -> Option<Bytes> {
-        self.receive(usize::MAX).await.ok()
-    }
-
     /// Receives until the end, at most `most` bytes.
     async fn receive(&mut self, most: usize) -> Result<Bytes, NoBody> {
         if self.is_cut {

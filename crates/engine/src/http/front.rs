@@ -1,7 +1,6 @@
 //! What the connections of a server have in common: settings, certificates, counters, and where
 //! requests go.
 
-use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -16,7 +15,6 @@ use crate::server::connections::admission::ConnectionLimits;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::event::{Kind, Reporter};
-use crate::server::rights::sources::contain;
 use crate::tls::server::ServerTls;
 
 #[derive(Debug)]
@@ -59,11 +57,6 @@ impl Front {
             tls: tls.map(Reloadable::from),
             next: AtomicU64::new(0),
         }
-    }
-
-    /// Whether a client may connect.
-    pub(super) fn admits(&self, peer: IpAddr) -> bool {
-        contain(&self.settings.sources, peer)
     }
 
     /// Uses these certificates for new connections. Returns those before.

@@ -59,7 +59,7 @@ pub(super) struct Line {
     /// Whether somebody waits for the body of the request. hyper reads ahead without it.
     is_asked: bool,
     /// Whether the peer has sent anything.
-    is_used: bool,
+    pub(super) is_used: bool,
     answer: Answer,
     pub(super) exchange: Option<Arc<Exchange>>,
     /// Since when it waits for what it waits for.
@@ -186,10 +186,6 @@ impl Line {
     /// Whether it waits for the next request, and nothing else is left to do.
     pub(super) fn is_idle(&self) -> bool {
         self.idle_due.is_some() && self.unsent.is_empty()
-    }
-
-    pub(super) fn is_used(&self) -> bool {
-        self.is_used
     }
 
     /// Whether the peer may still send what nobody reads. Closing the socket then could destroy the

@@ -22,6 +22,7 @@ use crate::server::connections::listener::{Admitted, ListenerContext, Service, S
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::counters::ConnectionCounters;
 use crate::server::reports::event::{self, Events, Kind, Verbosity};
+use crate::server::rights::sources::contain;
 use crate::tls::TlsFailure;
 use crate::tls::server::ServerTls;
 use crate::wake::Wakes;
@@ -35,7 +36,7 @@ impl Service for Front {
     type PeerRights = ();
 
     fn rights(&self, peer: IpAddr) -> Option<Arc<()>> {
-        self.admits(peer).then(|| Arc::new(()))
+        contain(&self.settings.sources, peer).then(|| Arc::new(()))
     }
 
     fn ends(&self, _before: &Front, _peer: &Peer) -> Option<Kind> {
