@@ -63,7 +63,7 @@ pub(crate) struct Waiting {
     /// `None` for a timeout that never ends.
     until: Option<Instant>,
     /// The longest wait for the reply, once it was sent.
-    pub(super) longest_wait: Duration,
+    longest_wait: Duration,
     is_broadcast: bool,
     has_ended: bool,
 }

@@ -17,7 +17,6 @@ pub(crate) mod scheduling;
 pub(crate) mod sockets;
 
 pub(crate) use access::Link;
-pub(crate) use caller::Waiting;
 pub use caller::{Called, Caller};
 pub use fault::Fault;
 pub(crate) use fault::{confirmation, exception, exception_code, exception_in, fault};
@@ -26,7 +25,7 @@ pub use limits::lease_fence::{Fence, Stage};
 pub(crate) use limits::lease_fence::{Pass, submit_under};
 pub(crate) use limits::permit::{Permit, Wanted};
 pub(crate) use limits::standstill;
-pub(crate) use route::{Asker, Call};
+pub(crate) use route::{Asker, Call, Receiver};
 pub use route::{LinkCounters, LinkSettings, Route, SharedLink};
 pub use scheduling::in_flight::InFlight;
 pub(crate) use scheduling::pending_reply::{PendingReply, Reply, ReplyTo, pending_reply};

@@ -12,6 +12,7 @@ use holdfast_runtime::{Retry, lock, time_since_boot};
 use tokio::sync::mpsc;
 
 use super::caller::{Caller, Waiting};
+use super::fault::exception_in;
 use crate::client::{self, ClientError, Endpoint, StrayCounters};
 use crate::counter::counters;
 use crate::link::limits::permit::Wanted;
@@ -101,14 +102,18 @@ pub(crate) struct Call {
 /// when this is dropped.
 pub(super) struct Reply {
     to: Receiver,
+    /// The longest time that it may take after the request was sent. Event loops wait as long as the most
+    /// patient route of the link.
+    pub(super) longest_wait: Duration,
     /// What its connection asks for after it waits for its end.
     in_order: Option<InOrder>,
     _place: Place,
 }
 
-enum Receiver {
-    /// With the timeout after the request was sent.
-    Listener(ReplyTo, Duration),
+/// Who gets a reply.
+pub(crate) enum Receiver {
+    /// The client of a listener.
+    Client(ReplyTo),
     EventLoop(Waiting),
 }
 
@@ -203,9 +208,10 @@ impl SharedLink {
         let request = adapted.as_ref().unwrap_or(request);
         let priority = Priority::of(request, None, &self.preferred);
         let (ticket, waiting) = caller.begin(request, timeout, is_broadcast);
-        let waiting = waiting.at_most(self.longest_wait());
+        let longest_wait = self.longest_wait();
+        let to = Receiver::EventLoop(waiting.at_most(longest_wait));
         let (request, queued, source) = (request.clone(), time_since_boot(), caller.source);
-        let reply = Reply { to: Receiver::EventLoop(waiting), in_order: None, _place: place };
+        let reply = Reply { to, longest_wait, in_order: None, _place: place };
         // If the link has ended, the call ends as lost.
         let _ = self.calls.send(Call { unit_id, request, queued, source, priority, reply });
         Some(ticket)
@@ -253,7 +259,8 @@ impl Route {
             source: asker.source,
             priority,
             reply: Reply {
-                to: Receiver::Listener(to, self.timeout),
+                to: Receiver::Client(to),
+                longest_wait: self.timeout,
                 in_order: None,
                 _place: place,
             },
@@ -269,9 +276,8 @@ impl Reply {
     /// Passes a reply on, or the error of a request, which is an exception for listeners.
     pub(super) fn send(self, outcome: Result<&[u8], (&Arc<ClientError>, &[u8])>) {
         match (self.to, outcome) {
-            (Receiver::Listener(to, _), Ok(pdu) | Err((_, pdu))) => to.send(pdu.to_vec()),
-            (Receiver::EventLoop(to), Ok(pdu)) => to.end(Ok(pdu.to_vec())),
             (Receiver::EventLoop(to), Err((error, _))) => to.end(Err(Arc::clone(error))),
+            (to, Ok(pdu) | Err((_, pdu))) => to.send(pdu.to_vec()),
         }
     }
 
@@ -280,18 +286,14 @@ impl Reply {
         self.in_order = Some(in_order);
     }
 
-    /// Whether the caller has given up.
     pub(super) fn is_unwanted(&self) -> bool {
-        match &self.to {
-            Receiver::Listener(to, _) => to.is_unwanted(),
-            Receiver::EventLoop(to) => to.is_unwanted(),
-        }
+        self.to.is_unwanted()
     }
 
     /// Waits until the client of a listener has disconnected.
     pub(super) fn client_gone(&self) -> impl Future<Output = ()> + use<> {
         let gone = match &self.to {
-            Receiver::Listener(to, _) => Some(to.gone()),
+            Receiver::Client(to) => Some(to.gone()),
             Receiver::EventLoop(_) => None,
         };
         async move {
@@ -303,29 +305,45 @@ impl Reply {
     }
 
     pub(super) fn is_of_listener(&self) -> bool {
-        matches!(self.to, Receiver::Listener(..))
+        matches!(self.to, Receiver::Client(_))
     }
 
     /// How long to wait for a reply to a request that is sent now.
     pub(super) fn timeout(&self) -> Duration {
         match &self.to {
-            Receiver::Listener(_, timeout) => *timeout,
+            Receiver::Client(_) => self.longest_wait,
             Receiver::EventLoop(to) => to.reply_timeout(),
         }
     }
 
-    /// The longest time that the reply may take. Event loops wait as long as the most patient route of the link.
-    pub(super) fn longest_wait(&self) -> Duration {
-        match &self.to {
-            Receiver::Listener(_, timeout) => *timeout,
-            Receiver::EventLoop(to) => to.longest_wait,
+    pub(super) fn wanted(&self) -> Wanted {
+        self.to.wanted()
+    }
+}
+
+impl Receiver {
+    pub(crate) fn send(self, pdu: Vec<u8>) {
+        match self {
+            Receiver::Client(to) => to.send(pdu),
+            Receiver::EventLoop(to) => to.end(match exception_in(&pdu) {
+                Some(code) => Err(Arc::new(ClientError::Exception(code))),
+                None => Ok(pdu),
+            }),
         }
     }
 
-    /// What is asked at the last moment before the request is sent.
-    pub(super) fn wanted(&self) -> Wanted {
-        match &self.to {
-            Receiver::Listener(to, _) => to.wanted(),
+    /// Whether the caller has given up.
+    pub(crate) fn is_unwanted(&self) -> bool {
+        match self {
+            Receiver::Client(to) => to.is_unwanted(),
+            Receiver::EventLoop(to) => to.is_unwanted(),
+        }
+    }
+
+    /// What is asked at the last moment before the request is sent: it may have waited for its turn until then.
+    pub(crate) fn wanted(&self) -> Wanted {
+        match self {
+            Receiver::Client(to) => to.wanted(),
             Receiver::EventLoop(to) => to.wanted(),
         }
     }

@@ -18,9 +18,8 @@ use super::destination::ReadSettings;
 use crate::client::ClientError;
 use crate::items::{Items, touched};
 use crate::link::{
-    Caller, Down, Fault, Fence, Link, PendingReply, Permit, Priority, ReplyTo, Waiting, Wanted,
-    confirmation, exception, exception_code, exception_in, fault, pending_reply, standstill,
-    submit_under,
+    Caller, Down, Fault, Fence, Link, PendingReply, Permit, Priority, Receiver, confirmation,
+    exception, exception_code, exception_in, fault, pending_reply, standstill, submit_under,
 };
 
 /// The most writes into one memory that wait for devices.
@@ -61,40 +60,6 @@ pub(super) struct PassedWrite {
     queued: Duration,
     reply: Receiver,
     _place: Place,
-}
-
-/// Who gets the answer.
-enum Receiver {
-    Client(ReplyTo),
-    EventLoop(Waiting),
-}
-
-impl Receiver {
-    /// Whether its client has gone.
-    fn is_unwanted(&self) -> bool {
-        match self {
-            Receiver::Client(to) => to.is_unwanted(),
-            Receiver::EventLoop(to) => to.is_unwanted(),
-        }
-    }
-
-    /// What is asked when the write is sent: its device may have waited for its turn on the line until then.
-    fn wanted(&self) -> Wanted {
-        match self {
-            Receiver::Client(to) => to.wanted(),
-            Receiver::EventLoop(to) => to.wanted(),
-        }
-    }
-
-    fn send(self, pdu: Vec<u8>) {
-        match self {
-            Receiver::Client(to) => to.send(pdu),
-            Receiver::EventLoop(to) => to.end(match exception_in(&pdu) {
-                Some(code) => Err(Arc::new(ClientError::Exception(code))),
-                None => Ok(pdu),
-            }),
-        }
-    }
 }
 
 /// Values that a device has accepted or returned, in its own addresses.

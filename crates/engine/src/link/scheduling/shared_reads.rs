@@ -59,7 +59,7 @@ impl SharedReads {
 
     /// Lets a request wait with equal reads, if it is a read.
     pub(in crate::link) fn join(&self, read: Option<ReadKey>, reply: Reply) -> Joining<'_> {
-        let read = read.filter(|_| self.coalesce).map(|read| (read, reply.longest_wait()));
+        let read = read.filter(|_| self.coalesce).map(|read| (read, reply.longest_wait));
         let equal = match &read {
             Some(read) => Rc::clone(self.waiting.borrow_mut().entry(read.clone()).or_default()),
             None => Rc::default(),
