@@ -2,12 +2,11 @@
 //! the socket; replies go straight to the futures of their requests.
 
 use std::collections::VecDeque;
-use std::hash::{BuildHasher, RandomState};
 use std::io;
 use std::sync::Mutex;
 use std::time::Duration;
 
-use holdfast_engine::client::{ClientError, Direction, Lost, Place};
+use holdfast_engine::client::{ClientError, Direction, Lost, Place, connection};
 use holdfast_engine::tls::TlsFailure;
 use holdfast_protocol::client::{
     Attempt as CoreAttempt, Closed, Connection as Core, Done, Failure, Ticket, Transport,
@@ -113,9 +112,7 @@ impl Connection {
         };
         let time = event_loop.getattr("time")?;
         let now = clock(time.call0()?.extract()?)?;
-        let core = Core::tolerant(Transport::Tcp, endpoint.core.tolerance, now);
-        // The keys of a hasher are random.
-        let mut core = core.unpredictable(RandomState::new().hash_one(0));
+        let mut core = connection(Transport::Tcp, endpoint.core.tolerance, now);
         if let Some(last) = last {
             core.follow(lock(&last.state).core.take_past(now));
         }

@@ -3,7 +3,6 @@
 //! The connection is opened on first use and kept open. [`Done::again`] decides whether a request is
 //! sent again.
 
-use std::hash::{BuildHasher, RandomState};
 use std::io::ErrorKind;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
@@ -20,7 +19,7 @@ use super::connect::connect;
 use super::fair_lock::Turns;
 use super::interrupt::{Interrupt, SIGNAL_CHECK_INTERVAL};
 use super::trace::{Trace, Traced};
-use super::{ClientError, Endpoint, Lost, Place, StrayCounters};
+use super::{ClientError, Endpoint, Lost, Place, StrayCounters, connection};
 
 /// Bytes per read of a socket. No Modbus datagram is longer.
 const CHUNK_BYTES: usize = 512;
@@ -382,9 +381,7 @@ impl Open {
             StreamError::Tls(failure) => ClientError::Tls { to: to(), failure, maybe_sent: false },
         })?;
         let now = Instant::now();
-        let connection = Connection::tolerant(transport, endpoint.tolerance, epoch.elapsed());
-        // The keys of a hasher are random.
-        let connection = connection.unpredictable(RandomState::new().hash_one(0));
+        let connection = connection(transport, endpoint.tolerance, epoch.elapsed());
         let connection = match &endpoint.place {
             Place::Serial(line) => connection.on_line(line.character()),
             _ => connection,

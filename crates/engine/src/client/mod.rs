@@ -18,13 +18,22 @@ pub use endpoint::{Endpoint, Place};
 pub use stray_counts::StrayCounters;
 pub use trace::{Direction, Trace};
 
+use std::hash::{BuildHasher, RandomState};
 use std::io;
 use std::time::Duration;
 
-use holdfast_protocol::client::{Closed, Failure, InvalidResponse};
+use holdfast_protocol::client::{
+    Closed, Connection, Failure, InvalidResponse, Tolerance, Transport,
+};
 use thiserror::Error;
 
 use crate::tls::TlsFailure;
+
+/// A connection whose transaction ids begin with a random number.
+pub fn connection(transport: Transport, tolerance: Tolerance, now: Duration) -> Connection {
+    // The keys of a hasher are random.
+    Connection::tolerant(transport, tolerance, now).unpredictable(RandomState::new().hash_one(0))
+}
 
 /// Why a call failed.
 #[derive(Debug, Error)]

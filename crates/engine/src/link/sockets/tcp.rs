@@ -3,7 +3,6 @@
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::future::poll_fn;
-use std::hash::{BuildHasher, RandomState};
 use std::io::{self, ErrorKind};
 use std::rc::Rc;
 use std::sync::Arc;
@@ -22,7 +21,7 @@ use tokio::sync::{Mutex, oneshot};
 use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
-use crate::client::{ClientError, StrayCounters};
+use crate::client::{ClientError, StrayCounters, connection};
 use crate::link::fault::Exchanged;
 use crate::link::limits::connect_pause::ConnectPause;
 use crate::link::limits::flood::Flood;
@@ -246,9 +245,7 @@ impl TcpLink {
         let _ = stream.set_nodelay(true);
         let (reader, writer) = stream.into_split();
         let (transport, now) = (Transport::Tcp, self.epoch.elapsed());
-        let connection = Connection::tolerant(transport, self.tolerance, now);
-        // The keys of a hasher are random.
-        let mut connection = connection.unpredictable(RandomState::new().hash_one(0));
+        let mut connection = connection(transport, self.tolerance, now);
         connection.follow(self.past.take());
         let open = Open {
             connection,
