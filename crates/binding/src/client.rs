@@ -12,7 +12,7 @@ use holdfast_engine::tls::FileError;
 use holdfast_engine::tls::client::{ClientSettings, ClientTls, TlsError};
 use holdfast_engine::{LineDirection, LineMode, LineParity, SerialLine};
 use holdfast_memory::{Area, Span};
-use holdfast_protocol::client::{AcceptUnit, Closed, Echo, Tolerance};
+use holdfast_protocol::client::{AcceptUnit, Closed, Echo, InvalidResponse as Invalid, Tolerance};
 use holdfast_protocol::pdu::identification::ReadCode;
 use holdfast_protocol::pdu::{
     self, Bits, Diagnostics, EncodedRequest, ExceptionCode, FileRange, FileRanges, FileRecords,
@@ -313,6 +313,7 @@ impl Endpoint {
 #[pyclass(frozen, module = "holdfast")]
 pub struct BlockingClient {
     core: Core,
+    tolerance: Tolerance,
     trace: Option<Arc<Py<PyAny>>>,
     /// How often calls were ended.
     ended: AtomicU64,
@@ -333,7 +334,8 @@ impl BlockingClient {
                 }
             })),
         };
-        BlockingClient { core, trace, ended: AtomicU64::new(0) }
+        let tolerance = endpoint.core.tolerance;
+        BlockingClient { core, tolerance, trace, ended: AtomicU64::new(0) }
     }
 
     /// Sends a request and returns its result as a Python object. Once `is_cancelled` returns true, the
@@ -349,8 +351,10 @@ impl BlockingClient {
     ) -> PyResult<Bound<'py, PyAny>> {
         let unit = byte("unit", unit)?;
         let timeout = seconds("timeout", timeout)?;
-        let request = &request.encoded;
-        let take = |response: Response<'_>, _: &[u8]| Reply::new(response);
+        // Its reply is parsed as one to the request that is sent.
+        let adapted = self.tolerance.adapted(&request.encoded);
+        let request = adapted.as_ref().unwrap_or(&request.encoded);
+        let take = |_: Response<'_>, pdu: &[u8]| pdu.to_vec();
         let is_cancelled = || {
             let Some(is_cancelled) = &is_cancelled else { return false };
             // Without an answer, nothing is sent.
@@ -367,10 +371,10 @@ impl BlockingClient {
             self.core.interruptible_call(interrupted, &to_begin, &was_sent, called, timeout, take)
         })?;
         let closed = || Err(ClientError::Lost(Lost::Closed(Closed::BySelf)));
-        result
+        let pdu = result
             .unwrap_or_else(closed)
-            .map_err(|error| of_request(py, &error, was_sent.load(Ordering::Relaxed)))?
-            .into_python(py)
+            .map_err(|error| of_request(py, &error, was_sent.load(Ordering::Relaxed)))?;
+        value(py, response(request, &pdu).map_err(|error| raised(&error))?)
     }
 
     /// Ends the call that waits for its reply, and its connection.
@@ -500,81 +504,42 @@ pub fn line(
     })
 }
 
-/// A response that owns its data.
-pub(crate) enum Reply {
-    /// Packed bits, and their number.
-    Bits(Vec<u8>, usize),
-    Registers(Vec<u8>),
-    Written,
-    Bytes(Vec<u8>),
-    EventCounter(bool, u16),
-    EventLog(bool, u16, u16, Vec<u8>),
-    Status(u8),
-    Files(Vec<Vec<u8>>),
-    Identification(u8, Option<u8>, Vec<(u8, Vec<u8>)>),
-}
-
-impl Reply {
-    pub(crate) fn new(response: Response<'_>) -> Reply {
-        match response {
-            Response::Bits(bits) => Reply::Bits(bits.as_bytes().to_vec(), bits.quantity().into()),
-            Response::ExceptionStatus(outputs) => Reply::Status(outputs),
-            Response::EventLog { busy, events, messages, log } => {
-                Reply::EventLog(busy, events, messages, log.to_vec())
-            }
-            Response::FileRecords(answer) => {
-                Reply::Files(answer.iter().map(<[u8]>::to_vec).collect())
-            }
-            Response::Queue(registers) => {
-                Reply::Registers(registers.map_or_else(Vec::new, |each| each.as_bytes().to_vec()))
-            }
-            Response::Registers(registers) => Reply::Registers(registers.as_bytes().to_vec()),
-            Response::Written => Reply::Written,
-            Response::Diagnostics(data) | Response::ServerId(data) | Response::Opaque(data) => {
-                Reply::Bytes(data.to_vec())
-            }
-            Response::EventCounter { busy, events } => Reply::EventCounter(busy, events),
-            Response::Identification(answer) => {
-                let objects = answer.iter().map(|(id, value)| (id, value.to_vec())).collect();
-                Reply::Identification(answer.conformity_level, answer.next, objects)
-            }
-        }
+/// The response that a PDU is. That of a broadcast is empty.
+pub(crate) fn response<'p>(
+    request: &EncodedRequest,
+    pdu: &'p [u8],
+) -> Result<Response<'p>, ClientError> {
+    if pdu.is_empty() {
+        return Ok(Response::Written);
     }
-
-    pub(crate) fn into_python<'py>(self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        Ok(match self {
-            Reply::Bits(bits, quantity) => {
-                let bit = |index: usize| bits[index / 8] >> (index % 8) & 1 == 1;
-                PyList::new(py, (0..quantity).map(bit))?.into_any()
-            }
-            Reply::Registers(registers) => words(py, &registers)?,
-            Reply::Written => py.None().into_bound(py),
-            Reply::Bytes(data) => PyBytes::new(py, &data).into_any(),
-            Reply::EventCounter(busy, events) => (busy, events).into_pyobject(py)?.into_any(),
-            Reply::Status(outputs) => outputs.into_pyobject(py)?.into_any(),
-            Reply::EventLog(busy, events, messages, log) => {
-                (busy, events, messages, PyBytes::new(py, &log)).into_pyobject(py)?.into_any()
-            }
-            Reply::Files(ranges) => {
-                let ranges = ranges.iter().map(|records| words(py, records));
-                PyList::new(py, ranges.collect::<PyResult<Vec<_>>>()?)?.into_any()
-            }
-            Reply::Identification(conformity, next, objects) => {
-                let objects: Vec<(u8, Bound<'_, PyBytes>)> =
-                    objects.iter().map(|(id, value)| (*id, PyBytes::new(py, value))).collect();
-                (conformity, next, objects).into_pyobject(py)?.into_any()
-            }
-        })
-    }
+    request.response(pdu).map_err(|error| ClientError::Invalid(Invalid::Pdu(error)))
 }
 
 /// A response as a Python object.
 pub(crate) fn value<'py>(py: Python<'py>, response: Response<'_>) -> PyResult<Bound<'py, PyAny>> {
-    match response {
-        // Most are registers: without a copy.
-        Response::Registers(registers) => words(py, registers.as_bytes()),
-        other => Reply::new(other).into_python(py),
-    }
+    Ok(match response {
+        Response::Bits(bits) => PyList::new(py, bits.iter().collect::<Vec<_>>())?.into_any(),
+        Response::Registers(registers) => words(py, registers.as_bytes())?,
+        Response::Queue(registers) => words(py, registers.map_or(&[][..], |each| each.as_bytes()))?,
+        Response::Written => py.None().into_bound(py),
+        Response::Diagnostics(data) | Response::ServerId(data) | Response::Opaque(data) => {
+            PyBytes::new(py, data).into_any()
+        }
+        Response::EventCounter { busy, events } => (busy, events).into_pyobject(py)?.into_any(),
+        Response::ExceptionStatus(outputs) => outputs.into_pyobject(py)?.into_any(),
+        Response::EventLog { busy, events, messages, log } => {
+            (busy, events, messages, PyBytes::new(py, log)).into_pyobject(py)?.into_any()
+        }
+        Response::FileRecords(answer) => {
+            let ranges = answer.iter().map(|records| words(py, records));
+            PyList::new(py, ranges.collect::<PyResult<Vec<_>>>()?)?.into_any()
+        }
+        Response::Identification(answer) => {
+            let objects = answer.iter().map(|(id, value)| (id, PyBytes::new(py, value)));
+            let objects: Vec<(u8, Bound<'_, PyBytes>)> = objects.collect();
+            (answer.conformity_level, answer.next, objects).into_pyobject(py)?.into_any()
+        }
+    })
 }
 
 fn words<'py>(py: Python<'py>, registers: &[u8]) -> PyResult<Bound<'py, PyAny>> {

@@ -4,13 +4,12 @@ use std::net::IpAddr;
 use std::sync::{Arc, Mutex};
 
 use holdfast_engine::Wakes;
-use holdfast_engine::client::{ClientError, StrayCounters};
+use holdfast_engine::client::StrayCounters;
 use holdfast_engine::link::{
     Caller as CoreCaller, InFlight, LinkSettings, Route as CoreRoute, SharedLink,
 };
 use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
 use holdfast_memory::Area;
-use holdfast_protocol::client::InvalidResponse;
 use holdfast_protocol::pdu::{self, Bits, Registers, Request as CoreRequest, limit};
 use holdfast_runtime::{Retry, lock};
 use pyo3::exceptions::{PyRuntimeError, PyValueError};
@@ -18,7 +17,7 @@ use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyDict};
 
 use crate::arguments::{byte, seconds, within};
-use crate::client::{Endpoint, Reply, Request, exception};
+use crate::client::{Endpoint, Request, exception, response, value};
 use crate::memory::named;
 
 /// The number of requests in flight; `None` is `auto`.
@@ -156,14 +155,9 @@ impl Caller {
     fn take<'py>(&self, py: Python<'py>) -> PyResult<Vec<Called<'py>>> {
         let called = self.core.take().into_iter().map(|call| {
             let result = match call.outcome {
-                // A broadcast has no reply.
-                Ok(pdu) if pdu.is_empty() => py.None().into_bound(py),
-                Ok(pdu) => match call.request.response(&pdu) {
-                    Ok(response) => Reply::new(response).into_python(py)?,
-                    Err(error) => {
-                        let invalid = ClientError::Invalid(InvalidResponse::Pdu(error));
-                        exception(py, &invalid)
-                    }
+                Ok(pdu) => match response(&call.request, &pdu) {
+                    Ok(response) => value(py, response)?,
+                    Err(error) => exception(py, &error),
                 },
                 Err(error) => exception(py, &error),
             };
