@@ -3,6 +3,7 @@
 use std::borrow::Cow;
 use std::ops::Range;
 
+use crate::bits;
 use crate::error::LayoutError;
 
 /// One of the four areas of the Modbus data model, or a file.
@@ -65,6 +66,26 @@ impl Area {
             }
         } else {
             into[to * 2..(to + count) * 2].copy_from_slice(&from[at * 2..(at + count) * 2]);
+        }
+    }
+
+    /// Copies `count` items, from item `at` of a range, to `out`, which has room for just them.
+    #[inline]
+    pub(crate) fn copy_out(self, from: &[u8], at: usize, count: usize, out: &mut [u8]) {
+        if self.is_bits() {
+            bits::copy_out(from, at, count, out);
+        } else {
+            out.copy_from_slice(&from[at * 2..(at + count) * 2]);
+        }
+    }
+
+    /// Copies `count` items, which are all of `values`, to item `at` of a range.
+    #[inline]
+    pub(crate) fn copy_in(self, into: &mut [u8], at: usize, count: usize, values: &[u8]) {
+        if self.is_bits() {
+            bits::copy_in(into, at, count, values);
+        } else {
+            into[at * 2..(at + count) * 2].copy_from_slice(values);
         }
     }
 

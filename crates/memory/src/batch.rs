@@ -2,7 +2,6 @@
 //! than the memory, and has as few pieces as possible.
 
 use crate::area::Area;
-use crate::bits;
 use crate::operation::Write;
 
 /// Limits of batches that are copied without flattening: allocating an image costs more than copying them.
@@ -43,11 +42,7 @@ pub(crate) fn flatten<'w>(writes: impl Iterator<Item = &'w Write<'w>> + Clone) -
         debug_assert_eq!(write.area, area);
         let at = usize::from(write.address) - start;
         written[at..at + write.count].fill(true);
-        if area.is_bits() {
-            bits::copy_in(&mut image, at, write.count, write.bytes);
-        } else {
-            image[at * 2..(at + write.count) * 2].copy_from_slice(write.bytes);
-        }
+        area.copy_in(&mut image, at, write.count, write.bytes);
     }
     let mut runs: Vec<Run> = Vec::new();
     let mut at = 0;
@@ -55,11 +50,7 @@ pub(crate) fn flatten<'w>(writes: impl Iterator<Item = &'w Write<'w>> + Clone) -
         let count = chunk.len();
         if chunk[0] {
             let mut bytes = vec![0; area.byte_len(count)];
-            if area.is_bits() {
-                bits::copy_out(&image, at, count, &mut bytes);
-            } else {
-                bytes.copy_from_slice(&image[at * 2..(at + count) * 2]);
-            }
+            area.copy_out(&image, at, count, &mut bytes);
             runs.push(Run { address: (start + at) as u16, count, bytes });
         }
         at += count;

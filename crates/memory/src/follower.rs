@@ -92,11 +92,7 @@ impl Followed {
             let last = (0..self.count).rfind(differs)?;
             let count = last - first + 1;
             let mut bytes = vec![0; self.area.byte_len(count)];
-            if self.area.is_bits() {
-                bits::copy_out(&self.now, first, count, &mut bytes);
-            } else {
-                bytes.copy_from_slice(&self.now[first * 2..(last + 1) * 2]);
-            }
+            self.area.copy_out(&self.now, first, count, &mut bytes);
             let address = self.address + first as u16;
             Some(Change { range, area: self.area, address, count, bytes })
         } else {

@@ -309,8 +309,9 @@ impl Memory {
         let member = *member;
         let action = match operation {
             Operation::Write(writes) => {
-                let valid = self.writable(access, writes, Ranges::Unreserved);
-                valid.map_err(|refused| refused.refusal)?;
+                for write in writes {
+                    self.writable(access, write, Ranges::Unreserved)?;
+                }
                 Action::Write(writes.iter().map(|write| StepWrite::new(member, write)).collect())
             }
             Operation::Mask { area, address, and_mask, or_mask } => {
@@ -318,7 +319,7 @@ impl Memory {
                 Action::Mask { member, area, address, and_mask, or_mask }
             }
             Operation::WriteThenRead { write, area, address, count } => {
-                self.writable(access, &[write], Ranges::Unreserved).map_err(Refused::alone)?;
+                self.writable(access, &write, Ranges::Unreserved)?;
                 self.holds(area, address, count)?;
                 self.fresh(&content, access, (area, address, count))?;
                 Action::WriteThenRead {
@@ -393,13 +394,13 @@ impl Memory {
     /// # Errors
     /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`, `Stale`. Then `out` is
     /// unchanged.
-    pub fn read(&self, access: Access, read: Read<'_>) -> Result<(), Refusal> {
+    pub fn read(&self, access: Access, mut read: Read<'_>) -> Result<(), Refusal> {
         let offset = self.readable(&read);
         let content = self.shared();
         if !content.is_open_to(access) {
             self.judge_read(&content, access, (read.area, read.address, read.count), offset)?;
         }
-        content.copy_out(offset?, read);
+        content.copy_out(offset?, &mut read);
         Ok(())
     }
 
@@ -429,9 +430,7 @@ impl Memory {
             readable.map_err(|refusal| Refused { index, refusal })?;
         }
         for read in reads {
-            let Read { area, address, count, ref mut out } = *read;
-            let offset = self.layout.offset_inside(area, address);
-            content.copy_out(offset, Read { area, address, count, out });
+            content.copy_out(self.layout.offset_inside(read.area, read.address), read);
         }
         Ok(())
     }
@@ -453,9 +452,7 @@ impl Memory {
         }
         if seen != Some(content.writes) {
             for read in reads {
-                let Read { area, address, count, ref mut out } = *read;
-                let offset = self.layout.offset_inside(area, address);
-                content.copy_out(offset, Read { area, address, count, out });
+                content.copy_out(self.layout.offset_inside(read.area, read.address), read);
             }
         }
         Ok(content.writes)
@@ -495,7 +492,8 @@ impl Memory {
         if self.has_journal() {
             return self.write_many_by_journal(access, writes);
         }
-        let valid = self.writable(access, writes, Ranges::Unreserved);
+        let each = writes.iter().map(|write| (self, write));
+        let valid = check_each(access, each, Ranges::Unreserved);
         let mut content = self.exclusive();
         content.admit(access).map_err(|refusal| Refused { index: 0, refusal })?;
         valid?;
@@ -574,21 +572,21 @@ impl Memory {
         &self,
         writer: Writer,
         write: Write<'_>,
-        read: Read<'_>,
+        mut read: Read<'_>,
         ranges: Ranges,
     ) -> Result<(), Refusal> {
-        let (access, writes) = (writer.access, [write]);
-        let valid = self.writable(access, &writes, ranges);
+        let access = writer.access;
+        let valid = self.writable(access, &write, ranges);
         let offset = self.readable(&read);
         let mut content = self.exclusive();
         content.admit(access)?;
-        valid.map_err(|refused| refused.refusal)?;
+        valid?;
         let offset = offset?;
         if ranges == Ranges::Unreserved {
             self.fresh(&content, access, (read.area, read.address, read.count))?;
         }
-        self.apply(writer, &mut content, &writes);
-        content.copy_out(offset, read);
+        self.apply(writer, &mut content, [&write]);
+        content.copy_out(offset, &mut read);
         Ok(())
     }
 
@@ -625,28 +623,17 @@ impl Memory {
         self.layout.offset(read.area, read.address, read.count).ok_or(Refusal::OutOfRange)
     }
 
-    /// Checks writes, without the lock.
-    fn writable(
-        &self,
-        access: Access,
-        writes: &[Write<'_>],
-        ranges: Ranges,
-    ) -> Result<(), Refused> {
-        for (index, write) in writes.iter().enumerate() {
-            let fits = write.count > 0 && write.bytes.len() == write.area.byte_len(write.count);
-            let Write { area, address, count, .. } = *write;
-            let admitted = if !fits {
-                Err(Refusal::WrongLength)
-            } else if self.layout.offset(area, address, count).is_none() {
-                Err(Refusal::OutOfRange)
-            } else {
-                self.gate
-                    .map_or(Ok(()), |gate| gate.admit_write(access, write))
-                    .and_then(|()| self.unreserved(access, area, address, count, ranges))
-            };
-            admitted.map_err(|refusal| Refused { index, refusal })?;
+    /// Checks a write, without the lock.
+    fn writable(&self, access: Access, write: &Write<'_>, ranges: Ranges) -> Result<(), Refusal> {
+        let Write { area, address, count, bytes } = *write;
+        if count == 0 || bytes.len() != area.byte_len(count) {
+            return Err(Refusal::WrongLength);
         }
-        Ok(())
+        self.layout.offset(area, address, count).ok_or(Refusal::OutOfRange)?;
+        if let Some(gate) = self.gate {
+            gate.admit_write(access, write)?;
+        }
+        self.unreserved(access, area, address, count, ranges)
     }
 
     /// Carries out writes that have been checked, then updates the seal. Without an age, mirrored ranges
@@ -675,11 +662,7 @@ impl Memory {
         debug_assert!(span.holds(write.address, write.count), "{write:?} is outside {span:?}");
         let offset = self.layout.offset_inside(write.area, write.address);
         let area = &mut content.areas[write.area.index()];
-        if write.area.is_bits() {
-            bits::copy_in(area, offset, write.count, write.bytes);
-        } else {
-            area[offset * 2..(offset + write.count) * 2].copy_from_slice(write.bytes);
-        }
+        write.area.copy_in(area, offset, write.count, write.bytes);
     }
 
     /// Updates the seal from the gate bit. Called once, after all writes of an access.
@@ -739,15 +722,11 @@ impl Content {
         }
     }
 
-    fn copy_out(&self, offset: usize, read: Read<'_>) {
+    fn copy_out(&self, offset: usize, read: &mut Read<'_>) {
         let area = &self.areas[read.area.index()];
         debug_assert!(read.area.byte_len(offset + read.count) <= area.len(), "{read:?}");
         debug_assert_eq!(read.out.len(), read.area.byte_len(read.count));
-        if read.area.is_bits() {
-            bits::copy_out(area, offset, read.count, read.out);
-        } else {
-            read.out.copy_from_slice(&area[offset * 2..(offset + read.count) * 2]);
-        }
+        read.area.copy_out(area, offset, read.count, read.out);
     }
 }
 
@@ -791,11 +770,7 @@ pub(crate) fn carry_out_across(
     writer: Writer,
     writes: &[(&Memory, Write<'_>)],
 ) -> Result<(), Refused> {
-    for (index, (memory, write)) in writes.iter().enumerate() {
-        memory
-            .writable(writer.access, std::slice::from_ref(write), Ranges::All)
-            .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
-    }
+    check_each(writer.access, writes.iter().map(|(memory, write)| (*memory, write)), Ranges::All)?;
     write_checked(writer, writes)
 }
 
@@ -848,12 +823,19 @@ fn write_checked(writer: Writer, writes: &[(&Memory, Write<'_>)]) -> Result<(), 
 /// # Errors
 /// As [`write_across`], without [`Refusal::Sealed`], [`Refusal::Unsealed`] and [`Refusal::NotOneStep`].
 pub fn check_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
-    for (index, (memory, write)) in writes.iter().enumerate() {
-        memory
-            .writable(access, std::slice::from_ref(write), Ranges::Unreserved)
-            .map_err(|Refused { refusal, .. }| Refused { index, refusal })?;
-    }
-    Ok(())
+    check_each(access, writes.iter().map(|(memory, write)| (*memory, write)), Ranges::Unreserved)
+}
+
+/// Checks writes, without the locks.
+fn check_each<'w>(
+    access: Access,
+    writes: impl Iterator<Item = (&'w Memory, &'w Write<'w>)>,
+    ranges: Ranges,
+) -> Result<(), Refused> {
+    writes.enumerate().try_for_each(|(index, (memory, write))| {
+        let valid = memory.writable(access, write, ranges);
+        valid.map_err(|refusal| Refused { index, refusal })
+    })
 }
 
 /// A write that has been checked, with the memory it was checked for.
