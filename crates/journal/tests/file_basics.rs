@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use holdfast_journal::file::{
-    Disk, FileError, FileOnDisk, MemoryFile, Options, Status, read_from, release,
+    Disk, FileError, FileOnDisk, MemoryFile, Options, QueueLimits, Status, read_from, release,
 };
 use holdfast_memory::{
     Access, Area, Freshness, Gate, GateMode, Layout, Memory, Mirrored, Read, Refusal, Span, Write,
@@ -199,10 +199,10 @@ fn steps_that_wait_are_stored_together() {
 
 #[test]
 fn the_queue_is_bounded_in_steps_and_bytes() {
-    for (max_steps, max_bytes) in [(10, usize::MAX), (usize::MAX, 4000)] {
+    for (steps, bytes) in [(10, usize::MAX), (usize::MAX, 4000)] {
         let disk = Arc::new(SimDisk::default());
         let one = memory(layout(0, 1000), None);
-        let options = Options { max_steps, max_bytes, ..at_once() };
+        let options = Options { queue: QueueLimits { steps, bytes }, ..at_once() };
         let file = keep(&disk, &[("one", &one)], options).unwrap();
         disk.hold(true);
         let mut coming = vec![submit(&one, 0, 1)];
@@ -228,7 +228,7 @@ fn the_queue_is_bounded_in_steps_and_bytes() {
 #[test]
 fn a_step_of_any_size_is_stored_when_no_other_waits() {
     let one = memory(layout(0, 1000), None);
-    let options = Options { max_bytes: 1000, ..at_once() };
+    let options = Options { queue: QueueLimits { steps: usize::MAX, bytes: 1000 }, ..at_once() };
     let _file = keep(&Arc::new(SimDisk::default()), &[("one", &one)], options).unwrap();
     let write = Write { area: REGISTERS, address: 0, count: 1000, bytes: &[1; 2000] };
     one.write(Access::Ingest, write).unwrap();

@@ -24,7 +24,6 @@
 mod area;
 mod batch;
 mod bits;
-mod carry_out;
 mod error;
 mod follower;
 mod memory;

@@ -34,9 +34,8 @@ pub struct Member {
 pub struct Options {
     /// Contents are stored after this time; with 0, before a write is answered.
     pub sync: Duration,
-    /// With `sync` 0: how many steps, and how many bytes of steps, may wait. One step always may.
-    pub max_steps: usize,
-    pub max_bytes: usize,
+    /// What may wait with `sync` 0.
+    pub queue: QueueLimits,
     /// With `sync` 0 and no step for this time: the file is looked for, and after an I/O error the next attempt
     /// follows.
     pub retry: Duration,
@@ -48,8 +47,7 @@ impl Options {
     pub const fn new(sync: Duration) -> Options {
         Options {
             sync,
-            max_steps: 4096,
-            max_bytes: 16 << 20,
+            queue: QueueLimits::DEFAULT,
             retry: Duration::from_secs(1),
             patience: Duration::from_secs(5),
         }
@@ -155,8 +153,7 @@ impl MemoryFile {
             }
         }
         let memories: Vec<_> = members.iter().map(|member| Arc::clone(&member.memory)).collect();
-        let limits = QueueLimits { steps: options.max_steps, bytes: options.max_bytes };
-        let queue = Arc::new(Queue::new(memories, limits, Arc::clone(&status)));
+        let queue = Arc::new(Queue::new(memories, options.queue, Arc::clone(&status)));
         if options.stores_before_reply() {
             for (number, member) in (0..).zip(&members) {
                 member.memory.keep_in(Arc::clone(&queue) as _, number);

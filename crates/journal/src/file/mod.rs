@@ -38,6 +38,7 @@ pub use image::StoredMemory;
 pub use memory_file::{Member, MemoryFile, Options};
 pub use overlay::Overlay;
 pub use periodic::Source;
+pub use queue::QueueLimits;
 pub use shrunk_memory::release;
 pub use status::Status;
 pub use store::VERSION;

@@ -27,11 +27,15 @@ pub(super) struct Queue {
     process: u32,
 }
 
-/// How much may wait.
+/// How many steps, and how many bytes of steps, may wait. One step always may.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct QueueLimits {
+pub struct QueueLimits {
     pub steps: usize,
     pub bytes: usize,
+}
+
+impl QueueLimits {
+    pub(super) const DEFAULT: QueueLimits = QueueLimits { steps: 4096, bytes: 16 << 20 };
 }
 
 struct State {

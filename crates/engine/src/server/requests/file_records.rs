@@ -5,7 +5,7 @@ use holdfast_memory::{Access, Area, Memory, Read, Write};
 use holdfast_protocol::pdu::{self, Buffer, ExceptionCode, FileRanges, FileRecords, reply};
 
 use crate::server::requests::exceptions::exception_of;
-use crate::server::requests::memory_operations::writing;
+use crate::server::requests::writing;
 
 pub(in crate::server) fn read(
     memory: &Memory,

@@ -7,7 +7,7 @@ use holdfast_protocol::pdu::{self, ExceptionCode, Request, reply};
 use crate::link::{PendingReply, Reply, ReplyTo, confirmation, exception, pending_reply};
 use crate::server::requests::exceptions::exception_of;
 use crate::server::requests::file_records;
-use crate::server::requests::memory_operations::writing;
+use crate::server::requests::writing;
 
 /// Gives a write to the journal.
 ///

@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::error::Refused;
-use crate::memory::{Memory, Ranges, Writer, carry_out_across};
+use crate::memory::checks::Ranges;
+use crate::memory::several_memories::carry_out_across;
+use crate::memory::{Memory, Writer};
 use crate::operation::{Read, Write};
 use crate::step::{Action, CarriedOut, Outcome, Step};
 
