@@ -101,13 +101,10 @@ class Begun:
     recording: Recording | None = None
 
     @property
-    def command(self) -> Mapping[str, Any] | None:
-        """The only command; `None` for a batch."""
-        return self.batch[0] if self.single else None
-
-    @property
     def where(self) -> dict[str, Any]:
-        """The target of the only command."""
+        """The target of the only command; empty for a batch."""
+        if not self.single:
+            return {}
         [command] = self.batch
         return place_of(None, command["memory"], command["area"], command["address"])
 
@@ -402,7 +399,7 @@ class MemoryAccess:
             if begun.recording is not None:
                 begun.recording.begin()
         except Unrecorded:
-            raise unrecorded(begun.command) from None
+            raise unrecorded(begun.where) from None
         except _core.BatchRefused as refused:
             begun.device = self._device(begun, refused)
         return begun
@@ -421,7 +418,7 @@ class MemoryAccess:
                 begun.recording.write()
             outcome: _Outcome = begun.writes.write()
         except Unrecorded:
-            raise unrecorded(begun.command) from None
+            raise unrecorded(begun.where) from None
         except _core.BatchRefused as refused:
             outcome = refused
         return self._kept(begun, outcome)
@@ -450,8 +447,8 @@ class MemoryAccess:
             if device is not None:
                 if begun.stale is None:
                     return device
-                where = place_of(None, command["memory"], command["area"], command["address"])
-                raise Refused("stale_command", f"not sent to {device}: {begun.stale}", **where)
+                detail = f"not sent to {device}: {begun.stale}"
+                raise Refused("stale_command", detail, **begun.where)
         index = None if begun.single else refused.command
         error = self._refused(command, refused, begun.grant, index)
         if refused.reason == "not_confirmed" and begun.recording is not None:
@@ -467,7 +464,7 @@ class MemoryAccess:
             try:
                 self._audit.require()
             except Unrecorded:
-                raise unrecorded(begun.command) from None
+                raise unrecorded(begun.where) from None
         passage = self._passages[command["memory"]]
         try:
             return write(passage, command["area"], command["address"], values)

@@ -70,11 +70,8 @@ def place_of(index: int | None, memory: str, area: str, address: int) -> dict[st
     }
 
 
-def unrecorded(command: Mapping[str, Any] | None) -> Refused:
+def unrecorded(where: Mapping[str, Any]) -> Refused:
     """A refusal of one command, or of a batch."""
-    where = {}
-    if command is not None:
-        where = place_of(None, command["memory"], command["area"], command["address"])
     detail = "the audit log can't be written, and no write is carried out without a record"
     return Refused("unrecorded", detail, **where)
 
