@@ -258,40 +258,39 @@ class MemoryAccess:
         self, memory: str, area: str, address: int, count: int, grant: Grant, peer: str
     ) -> list[int]:
         """Reads `count` values atomically. Raises `Refused`."""
-        try:
+        with self._counting_read(grant, peer):
             target = self._granted(memory, area, address, grant)
             try:
-                values = target.read(area, address, count)
+                return target.read(area, address, count)
             except (_core.OutOfRange, ValueError):  # A count below 1 is a `ValueError`.
                 raise self._out_of_range(memory, area, address, count) from None
             except OSError as error:
                 where = place_of(None, memory, area, address)
                 raise Refused(unreadable(error), str(error), **where) from None
-        except Refused as refused:
-            self.note(refused, grant.name, peer)
-            raise
-        with self._lock:
-            self._counts.reads += 1
-        return values
 
     def follow(
         self, memory: str, ranges: Sequence[tuple[str, int, int]], grant: Grant, peer: str
     ) -> Follower:
         """Returns a follower of ranges: area, address and count. Raises `Refused`."""
-        try:
+        with self._counting_read(grant, peer):
             for area, address, count in ranges:
                 target = self._granted(memory, area, address, grant)
                 try:
                     _core.Follower(target, [(area, address, count)])  # type: ignore[list-item]
                 except (_core.OutOfRange, ValueError):  # A count below 1 is a `ValueError`.
                     raise self._out_of_range(memory, area, address, count) from None
-            follower = _core.Follower(self.memories[memory], ranges)  # type: ignore[arg-type]
+            return _core.Follower(self.memories[memory], ranges)  # type: ignore[arg-type]
+
+    @contextlib.contextmanager
+    def _counting_read(self, grant: Grant, peer: str) -> Iterator[None]:
+        """Counts a read, or notes its `Refused`."""
+        try:
+            yield
         except Refused as refused:
             self.note(refused, grant.name, peer)
             raise
         with self._lock:
             self._counts.reads += 1
-        return follower
 
     def refuse(
         self, refused: Refused, who: str, peer: str, *, throttle: Throttle | None = None
@@ -303,7 +302,7 @@ class MemoryAccess:
         A write without a valid token has no line of its own: everybody can send any number of them.
         """
         by_nobody = refused.reason == "unauthorized"
-        self._note(refused, who, peer, observed=by_nobody, throttle=throttle)
+        self.note(refused, who, peer, observed=by_nobody, throttle=throttle)
         if self._audit is not None and not refused.is_recorded and not by_nobody:
             line = {
                 "listener": self.name,
@@ -318,19 +317,19 @@ class MemoryAccess:
             else:
                 self._audit.write_refused(**line)
 
-    def note(self, refused: Refused, who: str, peer: str) -> None:
-        """Logs and counts a refusal without a line of its own in the audit log, as of a read."""
-        self._note(refused, who, peer, observed=True)
-
-    def _note(
+    def note(
         self,
         refused: Refused,
         who: str,
         peer: str,
         *,
-        observed: bool,
+        observed: bool = True,
         throttle: Throttle | None = None,
     ) -> None:
+        """Logs and counts a refusal without a line of its own in the audit log, as of a read.
+
+        For `observed` and `throttle`, see `log_lines.count`.
+        """
         fields = {
             "adapter": self.name,
             "peer": peer,
