@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import struct
+import time
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast.outputs.sparkplug.datatypes import INT32, STRING, Datatype, datatype_of
-from holdfast.outputs.sparkplug.historical import Births
 from holdfast.outputs.tag_meaning import meaning_of
 
 if TYPE_CHECKING:
@@ -45,7 +45,8 @@ class DeviceMetrics:
         self.by_name: dict[str, Entry] = {}
         """The metrics by name. This and `by_alias` are for all threads."""
         self.by_alias: dict[int, Entry] = {}
-        self._births = Births()
+        self._births: dict[str, float] = {}
+        """When the tags had their values of the last birth."""
         self._bad: set[str] = set()
 
     def birth(self, payload: Any, latest: Mapping[str, Reading], aliases: Iterator[int]) -> None:
@@ -60,7 +61,7 @@ class DeviceMetrics:
             reading = latest.get(name)
             if reading is not None and not self._is_of_same_meaning(reading):
                 reading = None
-            at = self._births.add(name, reading)
+            at = self._births[name] = time.time() if reading is None else reading.time
             for entry in entries:
                 metric = payload.metrics.add(
                     name=entry.name,
@@ -77,7 +78,8 @@ class DeviceMetrics:
 
     def is_known(self, reading: Reading) -> bool:
         """Whether the birth had this reading, or there is no metric for it any more."""
-        return reading.tag.name not in self._entries or self._births.has(reading)
+        name = reading.tag.name
+        return name not in self._entries or self._births.get(name) == reading.time
 
     def add(self, payload: Any, reading: Reading) -> bool:
         """Adds the metrics of a reading.
@@ -87,7 +89,10 @@ class DeviceMetrics:
         name = reading.tag.name
         if not self._is_of_same_meaning(reading):
             return False
-        is_historical = self._births.is_historical(reading)
+        # A host stores what is historical, and does not show it as current: after an outage, the
+        # birth has the newest values, and those that waited follow. A birth that is in the future
+        # was before the clock was set back: nobody knows then.
+        is_historical = reading.time < self._births[name] <= time.time()
         entries, first = self._entries[name], len(payload.metrics)
         try:
             have_values = [_fill(payload.metrics.add(), entry, reading.value) for entry in entries]
