@@ -41,14 +41,13 @@ class TextFile(Receiver):
         self._file = settings.file
         self._max_bytes = settings.max_bytes
         self._rotation = Rotation(settings.file, settings.keep, self._not_rotated)
-        self._encode = ENCODINGS[settings.format]
         self._head = HEAD if settings.format == "csv" else b""
         self._form = FORMS[settings.format]
         self._open: io.FileIO | None = None
 
     def send(self, readings: list[Reading]) -> None:
         """Appends lines. They are in the file when this returns."""
-        data = self._encode(readings)
+        data = self._form.encode(readings)
         if not data:
             return
         file = self._opened(len(data))
@@ -102,8 +101,10 @@ def _is_same(file: io.FileIO, path: Path) -> bool:
 
 
 class Form(NamedTuple):
-    """How a file of an output is known, and what of its end is whole."""
+    """What a file of an output has, how it is known, and what of its end is whole."""
 
+    encode: Callable[[list[Reading]], bytes]
+    """The rows of readings."""
     begin: bytes
     """How the file begins."""
     row: re.Pattern[bytes]
@@ -179,26 +180,23 @@ def _influx(readings: list[Reading]) -> bytes:
     return lines(readings, MEASUREMENT, {})
 
 
-ENCODINGS: dict[str, Callable[[list[Reading]], bytes]] = {
-    "csv": _csv,
-    "jsonl": _json_lines,
-    "influx": _influx,
-}
-
 _INFLUX = f"{MEASUREMENT},device=".encode()
 
 FORMS = {
     "csv": Form(
+        _csv,
         HEAD,
         re.compile(rb"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9:.]{15}Z,", re.MULTILINE),
         re.compile(rb'(?:(?:[^"\n]++|"[^"]*+")*+\n)*+'),
     ),
     "jsonl": Form(
+        _json_lines,
         b'{"time":',
         re.compile(rb'^\{"time":', re.MULTILINE),
         re.compile(rb"(?:[^\n]*+\n)*+"),
     ),
     "influx": Form(
+        _influx,
         _INFLUX,
         re.compile(b"^" + _INFLUX, re.MULTILINE),
         # Quotes in names begin no text: only one behind a "=" that is not escaped does.
