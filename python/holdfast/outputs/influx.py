@@ -120,8 +120,7 @@ class Influx(Receiver):
         """Connects: also without a value, it shows whether the receiver can be reached."""
         if self._connection is not None and self._is_over(self._connection.sock):
             self.close()
-        if self._connection is None:
-            self._connection = self._opened()
+        self._connected()
         return True
 
     def close(self) -> None:
@@ -153,19 +152,18 @@ class Influx(Receiver):
         return self._request(body, headers)
 
     def _request(self, body: bytes, headers: dict[str, str]) -> tuple[int, bytes]:
-        if self._connection is None:
-            self._connection = self._opened()
+        connection = self._connected()
         # A receiver that sends a byte now and then does not exceed the timeout of the socket.
         self._is_late = False
         timer = threading.Timer(self._settings.timeout, self._time_out)
         timer.daemon = True
         timer.start()
         try:
-            self._connection.request("POST", self._path, body, headers)
-            answer = self._connection.getresponse()
+            connection.request("POST", self._path, body, headers)
+            answer = connection.getresponse()
             text = answer.read(MAX_RESPONSE_BYTES)
             # Without a socket, `http.client` would open one with the timeout for connecting.
-            if not answer.isclosed() or self._connection.sock is None:
+            if not answer.isclosed() or connection.sock is None:
                 self.close()
         except (http.client.HTTPException, OSError) as error:
             self.close()
@@ -196,13 +194,16 @@ class Influx(Receiver):
             with contextlib.suppress(OSError):
                 connection.sock.shutdown(socket.SHUT_RDWR)
 
-    def _opened(self) -> http.client.HTTPConnection:
-        if self._has_ended:
-            raise OSError("stopped")
-        connection = self._created(min(CONNECT_TIMEOUT_S, self._settings.timeout))
-        connection.connect()
-        connection.sock.settimeout(self._settings.timeout)
-        return connection
+    def _connected(self) -> http.client.HTTPConnection:
+        """The connection; a new one if there is none."""
+        if self._connection is None:
+            if self._has_ended:
+                raise OSError("stopped")
+            connection = self._created(min(CONNECT_TIMEOUT_S, self._settings.timeout))
+            connection.connect()
+            connection.sock.settimeout(self._settings.timeout)
+            self._connection = connection
+        return self._connection
 
     def _is_over(self, connection: socket.socket) -> bool:
         """Whether the receiver has closed a connection, or sends what nobody has asked for."""
