@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import ssl
 import threading
 import time
@@ -17,7 +18,7 @@ from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secure_channel import failure_text
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt.connection import Connection
-from holdfast.outputs.mqtt.delivery import Delivery, Message
+from holdfast.outputs.mqtt.delivery import Delivery, Message, unpacked_topic
 from holdfast.runtime.standstill import MAX_LOOK_INTERVAL_S, Standstill
 from holdfast.runtime.stop import Stop
 
@@ -154,7 +155,7 @@ class Session:
 
     def _opened(self, client_id: str, will: Message | None) -> Connection:
         """Connects, and waits for the broker's consent. A stop interrupts it."""
-        with Waiter(self._stop) as waiter:
+        with Waiter(self._stop) as waiter, contextlib.ExitStack() as undo:
             connection = Connection(
                 self._settings,
                 client_id,
@@ -165,11 +166,11 @@ class Session:
                 writes=self._standstill is not None,
                 proves=self._proves,
             )
+            undo.callback(connection.close)
             connection.on_disconnect = self._on_disconnect
             if will is not None:
-                connection.will_set(
-                    will.topic[2:].decode(), will.payload, self._will_qos, will.retain
-                )
+                topic = unpacked_topic(will.topic)
+                connection.will_set(topic, will.payload, self._will_qos, will.retain)
             try:
                 connection.open()
                 end = time.monotonic() + CONNACK_TIMEOUT_S
@@ -183,17 +184,12 @@ class Session:
                     reason = self._reason or connection.trouble
                     raise ConnectionError(reason or "the broker closed the connection")
             except Ended:
-                connection.close()
                 raise ConnectionError("stopped") from None
             except ssl.SSLError as error:  # That of a certificate is also a ValueError.
-                connection.close()
                 raise ConnectionError(failure_text(error)) from error
             except ValueError as error:
-                connection.close()
                 raise ConnectionError(f"the broker sent a malformed packet: {error}") from error
-            except BaseException:
-                connection.close()
-                raise
+            undo.pop_all()
         return connection
 
     def _serve(self) -> None:
