@@ -179,12 +179,10 @@ class Sending:
                 if self._receiver.idle():
                     self._worked(0)
                 return True
-        except OSError as error:
-            return self._failed(error)
-        try:
             self._send(readings)
         except OSError as error:
-            return self._failed(error)
+            self._failed(error)
+            return False
         self._worked(len(self._buffer) - len(readings))
         self._done()
         return True
@@ -226,7 +224,7 @@ class Sending:
         self._refused += refused
         self._sent += len(readings) - refused
 
-    def _failed(self, error: OSError) -> bool:
+    def _failed(self, error: OSError) -> None:
         self._last_error = str(error) or type(error).__name__
         self._pause = self._backoff.failed()
         if not self._is_failing:
@@ -234,7 +232,6 @@ class Sending:
             log_lines.write(
                 logging.WARNING, "output_failed", output=self._name, error=self._last_error
             )
-        return False
 
     def _wait(self, stop: Stop) -> None:
         """Waits for the next attempt, and moves new readings to the file meanwhile."""
