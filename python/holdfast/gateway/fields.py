@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from holdfast.net.addresses import LAST_PORT
 from holdfast.net.hosts import is_host
-from holdfast.net.http.fields import Field
+from holdfast.net.http.fields import Field, malformed
 from holdfast.net.http.schemas import Schema, integer
-from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, MAX_WORD, TLS_PORT
+from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT, MAX_WORD, TLS_PORT
 from holdfast.protocol import PORT as STANDARD_PORT
 from holdfast.types import AREAS, TRANSPORTS
 from holdfast.values.orders import DEFAULT_ORDER
@@ -92,6 +92,12 @@ WRITE_TIMEOUT_MS = 5_000
 POLL_TIMEOUT_MS = 5_000
 MAP_READ_TIMEOUT_MS = 2_000
 """The timeouts of requests that name none."""
+
+
+def check_end(address: int, count: int) -> None:
+    """Raises `BadRequest` for a range that goes beyond the last address."""
+    if address + count > ADDRESSES:
+        raise malformed(f"{count} from address {address}: the last address is {LAST_ADDRESS}")
 
 
 def timeout(default: int, longest: int, text: str = "Timeout of the request in ms") -> Field:

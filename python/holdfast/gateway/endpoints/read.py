@@ -8,12 +8,17 @@ from holdfast.errors import ModbusException
 from holdfast.gateway.device import exception_name, exception_text
 from holdfast.gateway.endpoint import EXAMPLE, Endpoint
 from holdfast.gateway.endpoints.typed import quantity_of, typed
-from holdfast.gateway.fields import ADDRESS, ADDRESS_SCHEMA, BYTE_ORDER, DATATYPE, REGISTER
+from holdfast.gateway.fields import (
+    ADDRESS,
+    ADDRESS_SCHEMA,
+    BYTE_ORDER,
+    DATATYPE,
+    REGISTER,
+    check_end,
+)
 from holdfast.net.http.fields import Field, malformed, value_text
 from holdfast.net.http.schemas import Schema, array_of, integer
 from holdfast.protocol import (
-    ADDRESSES,
-    LAST_ADDRESS,
     MAX_WORD,
     READ_BITS,
     READ_FUNCTIONS,
@@ -75,10 +80,7 @@ class Range:
         limit = READ_LIMITS[self.area]
         if not 1 <= self.quantity <= limit:
             raise malformed(f"Quantity must be between 1 and {limit}, found {self.quantity}")
-        if self.address + self.quantity > ADDRESSES:
-            raise malformed(
-                f"{self.quantity} from address {self.address}: the last address is {LAST_ADDRESS}"
-            )
+        check_end(self.address, self.quantity)
 
     @property
     def fields(self) -> dict[str, Any]:

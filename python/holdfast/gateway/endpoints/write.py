@@ -16,12 +16,11 @@ from holdfast.gateway.fields import (
     REGISTER,
     TYPED_SCHEMA,
     WRITE_TIMEOUT_MS,
+    check_end,
 )
-from holdfast.net.http.fields import Field, malformed
+from holdfast.net.http.fields import Field
 from holdfast.net.http.schemas import BOOLEAN, Schema, array, integer
 from holdfast.protocol import (
-    ADDRESSES,
-    LAST_ADDRESS,
     MAX_WORD,
     READ_WRITE,
     WRITE_BITS,
@@ -45,7 +44,7 @@ async def _write_coil(given: Given, device: RequestedDevice) -> Answer:
 
 async def _write_coils(given: Given, device: RequestedDevice) -> Answer:
     address, values = given["address"], [bool(each) for each in given["values"]]
-    _check_end(address, len(values))
+    check_end(address, len(values))
     await device.ask(lambda client: client.write_coils(address, values, unit=device.unit))
     return {"startAddress": address, "quantity": len(values)}
 
@@ -58,7 +57,7 @@ async def _write_register(given: Given, device: RequestedDevice) -> Answer:
 
 async def _write_registers(given: Given, device: RequestedDevice) -> Answer:
     address, values = given["address"], _registers(given)
-    _check_end(address, len(values))
+    check_end(address, len(values))
     await device.ask(lambda client: client.write_registers(address, values, unit=device.unit))
     return {"startAddress": address, "quantity": len(values)}
 
@@ -76,8 +75,8 @@ async def _mask(given: Given, device: RequestedDevice) -> Answer:
 async def _read_write(given: Given, device: RequestedDevice) -> Answer:
     first, quantity = given["readAddress"], given["readQuantity"]
     address, values = given["writeAddress"], given["values"]
-    _check_end(first, quantity)
-    _check_end(address, len(values))
+    check_end(first, quantity)
+    check_end(address, len(values))
     found = await device.ask(
         lambda client: client.read_write(first, quantity, address, values, unit=device.unit)
     )
@@ -98,11 +97,6 @@ def _registers(given: Given) -> Sequence[int]:
         return kind.encode(given["values"])
     checked: Sequence[int] = REGISTER_VALUES.check(given["values"])
     return checked
-
-
-def _check_end(address: int, count: int) -> None:
-    if address + count > ADDRESSES:
-        raise malformed(f"{count} from address {address}: the last address is {LAST_ADDRESS}")
 
 
 def _values(items: dict[str, Any], most: int, text: str) -> Field:
