@@ -5,7 +5,7 @@ from __future__ import annotations
 from holdfast.net.addresses import LAST_PORT
 from holdfast.net.hosts import is_host
 from holdfast.net.http.fields import Field, malformed
-from holdfast.net.http.schemas import Schema, integer
+from holdfast.net.http.schemas import Schema, array, integer
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT, MAX_WORD, TLS_PORT
 from holdfast.protocol import PORT as STANDARD_PORT
 from holdfast.types import AREAS, TRANSPORTS
@@ -75,13 +75,7 @@ BYTE_ORDER = Field(
 )
 AREA_LIST = Field(
     "areas",
-    {
-        "type": "array",
-        "minItems": 1,
-        "maxItems": len(AREAS),
-        "uniqueItems": True,
-        "items": {"type": "string", "enum": list(AREAS)},
-    },
+    array({"type": "string", "enum": list(AREAS)}, len(AREAS)) | {"uniqueItems": True},
     "The areas to map; default all four",
     None,
 )

@@ -26,7 +26,7 @@ from holdfast.net.http import health, openapi
 from holdfast.net.http.application import DOCUMENTS
 from holdfast.net.http.openapi import Api, html_answer, json_answer, stream_answer
 from holdfast.net.http.operations import Operation, body_of
-from holdfast.net.http.schemas import BOOLEAN, COUNT, object_of, ref
+from holdfast.net.http.schemas import BOOLEAN, COUNT, TEXT, object_of, ref
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def _of_device(endpoint: Endpoint, settings: Settings) -> Operation[App]:
     if endpoint.has_rtt:
         answer["rtt"], example["rtt"] = COUNT, 12
     if endpoint.broadcast:
-        answer["note"] = {"type": "string", "description": "Only for a broadcast"}
+        answer["note"] = TEXT | {"description": "Only for a broadcast"}
     whole = object_of(answer, optional=(*endpoint.optional, "note"))
     lenient = settings.compat == "port-of-call" and endpoint.path in port_of_call.PATHS
     body = partial(port_of_call.body, endpoint.path) if lenient else body_of

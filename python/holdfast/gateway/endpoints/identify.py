@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.client.requests import OBJECT_NAMES
 from holdfast.gateway.endpoint import EXAMPLE, Endpoint
-from holdfast.net.http.schemas import TEXT_OR_NULL, integer
+from holdfast.net.http.schemas import TEXT_OR_NULL, integer, map_of
 
 if TYPE_CHECKING:
     from holdfast.gateway.device import RequestedDevice
@@ -63,11 +63,7 @@ ENDPOINTS = (
         properties={
             **dict.fromkeys(_NAMES.values(), TEXT_OR_NULL),
             "conformityLevel": integer(0, 255),
-            "objects": {
-                "type": "object",
-                "additionalProperties": _HEX,
-                "description": "All objects by id, in hex",
-            },
+            "objects": map_of(_HEX, "All objects by id, in hex"),
         },
         examples={"A device": EXAMPLE},
         answer={

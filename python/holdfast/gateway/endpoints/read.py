@@ -17,7 +17,7 @@ from holdfast.gateway.fields import (
     check_end,
 )
 from holdfast.net.http.fields import Field, malformed, value_text
-from holdfast.net.http.schemas import Schema, array_of, integer
+from holdfast.net.http.schemas import TEXT, Schema, array_of, integer, map_of
 from holdfast.protocol import (
     MAX_WORD,
     READ_BITS,
@@ -140,16 +140,9 @@ TYPED: dict[str, Schema] = {
         "type": "array",
         "description": "With `datatype`: the values, `null` where `typedErrors` has the reason",
     },
-    "typedText": {
-        "type": "array",
-        "items": {"type": "string"},
-        "description": "The values as text; floats have the fewest digits that identify them",
-    },
-    "typedErrors": {
-        "type": "object",
-        "additionalProperties": {"type": "string"},
-        "description": "By index in `typed`: why the value is `null`",
-    },
+    "typedText": array_of(TEXT)
+    | {"description": "The values as text; floats have the fewest digits that identify them"},
+    "typedErrors": map_of(TEXT, "By index in `typed`: why the value is `null`"),
 }
 
 RANGE_PROPERTIES: dict[str, Schema] = {
@@ -170,11 +163,7 @@ ENDPOINTS = (
         ),
         carry_out=_connect,
         has_rtt=False,
-        properties={
-            "message": {"type": "string"},
-            "testRegister": REGISTER,
-            "exception": {"type": "string"},
-        },
+        properties={"message": TEXT, "testRegister": REGISTER, "exception": TEXT},
         optional=("testRegister", "exception"),
         examples={"A device on port 502": {"host": "plc.factory.local", "unitId": 1}},
         answer={"message": "Modbus server reachable", "testRegister": 42},
@@ -189,7 +178,7 @@ ENDPOINTS = (
         has_rtt=False,
         properties={
             "functionCode": FUNCTION_SCHEMA,
-            "functionName": {"type": "string"},
+            "functionName": TEXT,
             **RANGE_PROPERTIES,
         },
         optional=tuple(TYPED),

@@ -82,7 +82,7 @@ OPERATIONS: tuple[Operation[Any], ...] = (
         "tags",
         "Check a tag list",
         lambda app, _, given: app.check(request_tags.parse, given),
-        _valid({"tags": {"type": "array", "items": TAG}}, {"tags": [_SETPOINT]}),
+        _valid({"tags": array_of(TAG)}, {"tags": [_SETPOINT]}),
         ("busy",),
         "Parses a tag list as the command line does, and returns its tags. An error names the "
         "line, the tag and the key.",

@@ -13,12 +13,12 @@ from holdfast.errors import ModbusError, ModbusException
 from holdfast.gateway.device import Failed, exception_text, problem
 from holdfast.gateway.endpoint import TARGET
 from holdfast.gateway.endpoints.read import RANGE, Range
-from holdfast.gateway.endpoints.request_tags import LIST, MAX_TAGS, described, tags_of
+from holdfast.gateway.endpoints.request_tags import LIST, MAX_TAGS, NAME, described, tags_of
 from holdfast.gateway.fields import POLL_TIMEOUT_MS, timeout
 from holdfast.gateway.streams.watch import interval_field
 from holdfast.net.http.fields import Field, filled, malformed, object_with
 from holdfast.net.http.requests import BadRequest, shown
-from holdfast.net.http.schemas import BOOLEAN, Schema, integer
+from holdfast.net.http.schemas import BOOLEAN, Schema, array, integer
 from holdfast.tags.decoding import packed
 from holdfast.tags.text import plain, text_of
 from holdfast.types import BIT_AREAS
@@ -38,22 +38,12 @@ if TYPE_CHECKING:
 PATH = "/api/modbus/watch/view"
 MAX_PARTS = 32
 
-ONLY = Field(
-    "only",
-    {
-        "type": "array",
-        "minItems": 1,
-        "maxItems": MAX_TAGS,
-        "items": {"type": "string", "minLength": 1, "maxLength": 128},
-    },
-    "Only the tags with these names",
-    None,
-)
+ONLY = Field("only", array(NAME.schema, MAX_TAGS), "Only the tags with these names", None)
 TAGS = (*LIST, ONLY)
 PART_SCHEMA: Schema = {"oneOf": [object_with(RANGE), object_with(TAGS)]}
 PARTS = Field(
     "parts",
-    {"type": "array", "minItems": 1, "maxItems": MAX_PARTS, "items": PART_SCHEMA},
+    array(PART_SCHEMA, MAX_PARTS),
     "Ranges, and tag lists as text or by the name of a profile",
 )
 MAX_STREAMS = Field(
