@@ -3,7 +3,6 @@
 import { $, h } from "./dom.js";
 
 const KEY = "holdfast-token";
-export const JSON_TYPE = { "Content-Type": "application/json" };
 /** Tokens that a header can have. With another one, the browser sends nothing and reports no reason. */
 const SENDABLE = /^[\x21-\x7e]+$/;
 /** How long the gateway may need beyond the timeouts of the device, in milliseconds. */
@@ -26,18 +25,17 @@ export const forgetToken = () => sessionStorage.removeItem(KEY);
 /** Sends a GET request and returns the answer. */
 export const get = async (path) => answer(await send(path));
 
-/** Sends a POST request and returns the answer; `body` is an object or JSON text. */
-export const post = async (path, body, signal) =>
-  answer(await send(path, {
-    method: "POST",
-    headers: JSON_TYPE,
-    body: typeof body === "string" ? body : JSON.stringify(body),
-    signal,
-    extraTime: typeof body === "string" ? JSON.parse(body).timeout : body.timeout,
-  }));
+/** Sends a POST request and returns the answer; `body` is an object, or JSON text without a timeout. */
+export const post = async (path, body, signal) => answer(await sendJson(path, body, { signal, extraTime: body.timeout }));
+
+/** Sends a POST request; `body` is an object or JSON text. For the options, see `send`. */
+export function sendJson(path, body, options) {
+  const text = typeof body === "string" ? body : JSON.stringify(body);
+  return send(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: text, ...options });
+}
 
 /** Sends a request, and waits for `extraTime` beyond the usual time for the answer to begin. */
-export async function send(path, { extraTime = 0, signal, ...options } = {}) {
+async function send(path, { extraTime = 0, signal, ...options } = {}) {
   for (;;) {
     const token = sessionStorage.getItem(KEY);
     if (token !== null && !SENDABLE.test(token)) {

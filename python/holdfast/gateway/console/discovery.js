@@ -61,9 +61,10 @@ export class Discovery {
     const stopping = new AbortController();
     this.running = stopping;
     this.prepare(areas, first, last);
-    const body = JSON.stringify({ ...this.device, areas, first, last, exact: form.has("exact"), maxStreams: MAX_STREAMS.map });
+    const body = { ...this.device, areas, first, last, exact: form.has("exact"), maxStreams: MAX_STREAMS.map };
+    const options = { signal: stopping.signal, extraTime: this.device.timeout * areas.length };
     try {
-      await stream("/api/modbus/map", { method: "POST", body, signal: stopping.signal, extraTime: this.device.timeout * areas.length }, (name, data) => {
+      await stream("/api/modbus/map", body, options, (name, data) => {
         if (this.running === stopping) this.happened(name, data);
       });
       // A result ends the map.

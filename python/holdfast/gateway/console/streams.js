@@ -1,6 +1,6 @@
 // Streams of events from the gateway, and how many of them a browser may have.
 
-import { answer, JSON_TYPE, Problem, send } from "./api.js";
+import { answer, Problem, sendJson } from "./api.js";
 
 /**
  * The most streams of this browser, by what they are for. It has six connections to a host: a watch leaves two for
@@ -8,10 +8,9 @@ import { answer, JSON_TYPE, Problem, send } from "./api.js";
  */
 export const MAX_STREAMS = { watch: 4, map: 5 };
 
-/** Calls `onEvent(name, data)` for each event of a stream, until the stream ends. */
-export async function stream(path, options, onEvent) {
-  const headers = options.body ? JSON_TYPE : {};
-  const reply = await send(path, { ...options, headers });
+/** Asks for a stream, and calls `onEvent(name, data)` for each of its events, until it ends. */
+export async function stream(path, body, options, onEvent) {
+  const reply = await sendJson(path, body, options);
   if (!(reply.headers.get("Content-Type") ?? "").startsWith("text/event-stream")) {
     await answer(reply);
     throw new Problem("internal_error", "the gateway did not send an event stream");

@@ -221,17 +221,17 @@ export class Values {
     $("parts").hidden = $("parts-help").hidden = items.length === 0;
   }
 
-  /** Returns the options of a request for parts of the device. */
-  sent(wanted, more, signal) {
-    const body = JSON.stringify({ ...this.device, parts: wanted.map(parts.asked), ...more });
+  /** Asks for a stream of parts of the device. */
+  stream(wanted, more, signal, onEvent) {
+    const body = { ...this.device, parts: wanted.map(parts.asked), ...more };
     const extraTime = wanted.reduce((sum, part) => sum + (part.kind === "tags" ? LONG : this.device.timeout), 0);
-    return { method: "POST", body, signal, extraTime };
+    return stream(PATH, body, { signal, extraTime }, onEvent);
   }
 
   /** Reads parts once. Returns the data of the event. */
   async once(wanted, signal) {
     let data = null;
-    await stream(PATH, this.sent(wanted, { once: true }, signal), (_, found) => (data = found));
+    await this.stream(wanted, { once: true }, signal, (_, found) => (data = found));
     if (data === null) throw new Problem("gateway_gone", "the connection to the gateway ended");
     return data;
   }
@@ -360,7 +360,7 @@ export class Values {
       const more = { interval: this.interval, maxStreams: MAX_STREAMS.watch, describe };
       try {
         if (told !== null) await this.may.ask();
-        await stream(PATH, this.sent(wanted, more, stopping.signal), (name, data) => {
+        await this.stream(wanted, more, stopping.signal, (name, data) => {
           if (this.watching !== stopping) return;
           if (name === "view") {
             streams = data.stream;

@@ -64,10 +64,10 @@ class Change {
   /** Reads the value of a tag, which may be scaled by a register, and its words. */
   async readTag(signal) {
     const parts = [{ ...this.source, only: [this.tag.name] }, this.range()];
-    const body = JSON.stringify({ ...this.device, parts, once: true });
+    const body = { ...this.device, parts, once: true };
     let found = null;
     const extraTime = parts.length * this.device.timeout;
-    await stream("/api/modbus/watch/view", { method: "POST", body, signal, extraTime }, (_, data) => (found = data.parts));
+    await stream("/api/modbus/watch/view", body, { signal, extraTime }, (_, data) => (found = data.parts));
     if (found === null) throw new Problem("gateway_gone", "the gateway sent no value");
     const [own, words] = found;
     checkDefinition(this.tag, own.tags[0]);
