@@ -1,7 +1,7 @@
 // The map of a device: a picture of each area, and a list of its ranges.
 
 import { notice, Problem } from "./api.js";
-import { $, colour, h, onTheme, say } from "./dom.js";
+import { $, colour, h, onTheme, quiet, say } from "./dom.js";
 import { AREAS } from "./standard.js";
 import { MAX_STREAMS, stream } from "./streams.js";
 
@@ -166,8 +166,7 @@ class Picture {
   }
 
   buttons() {
-    const button = (text, label, onclick) =>
-      h("button", { class: "quiet", type: "button", "aria-label": `${label}: ${this.title.toLowerCase()}`, onclick }, text);
+    const button = (text, label, onclick) => quiet(text, `${label}: ${this.title.toLowerCase()}`, onclick);
     return h("span", { class: "zoom" },
       button("◀", "Lower addresses", () => this.move(-1)),
       button("▶", "Higher addresses", () => this.move(1)),

@@ -15,6 +15,10 @@ export function h(tag, properties = {}, ...children) {
   return element;
 }
 
+/** Creates a button that looks like text. Its label says what it is for where the text alone does not. */
+export const quiet = (text, label, onclick, kind = "") =>
+  h("button", { class: `quiet ${kind}`, type: "button", "aria-label": label, onclick }, text);
+
 /** Creates a table. The first cell of a row is its heading. */
 export const table = (kind, caption, head, rows) =>
   h("table", { class: kind },

@@ -29,6 +29,18 @@ export class Panel {
     this.place.append(root);
   }
 
+  /**
+   * Creates the table. Its last column has what can be done with a value. The roles keep it accessible where the style
+   * sheet makes cards of its rows.
+   */
+  frame(kind, head, rows) {
+    const heading = (content) => h("th", { role: "columnheader", scope: "col" }, content);
+    return h("table", { role: "table", class: kind, "aria-label": this.part.title },
+      h("thead", { role: "rowgroup" },
+        h("tr", { role: "row" }, head.map(heading), heading(h("span", { class: "unseen" }, "Actions")))),
+      h("tbody", { role: "rowgroup" }, rows));
+  }
+
   /** Shows what is for writing, or hides it. */
   permit(writes) {
     for (const each of this.root.querySelectorAll(".write")) each.hidden = !writes;

@@ -2,7 +2,7 @@
 
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 import { save, stamp } from "./csv.js";
-import { $, clock, colour, h, onTheme } from "./dom.js";
+import { $, clock, colour, h, onTheme, quiet } from "./dom.js";
 import { History } from "./history.js";
 
 const SPANS = { 120: "2 minutes", 600: "10 minutes", 3600: "1 hour" };
@@ -173,7 +173,7 @@ class Plot {
     this.body = h("div", { role: "img", "aria-label": `Plot of ${label}` });
     this.root = h("article", { class: "plot" },
       h("header", {}, h("h3", { class: "mono dim" }, label), this.output, this.extent,
-        h("button", { class: "quiet", type: "button", "aria-label": `Remove the plot of ${label}`, onclick: onRemove }, "✕")),
+        quiet("✕", `Remove the plot of ${label}`, onRemove)),
       this.body);
   }
 

@@ -1,7 +1,7 @@
 // The table of registers, or the grid of bits, with marks for changes.
 
 import { notice, post } from "./api.js";
-import { $, h, table } from "./dom.js";
+import { $, h, quiet, table } from "./dom.js";
 import { binary, hex, modicon } from "./numbers.js";
 import { Panel } from "./panel.js";
 import { AREAS, areaOf } from "./standard.js";
@@ -110,33 +110,28 @@ export class Table extends Panel {
   }
 
   registers() {
-    const { address, quantity, width, type, area } = this.part;
-    const body = h("tbody", { role: "rowgroup" });
-    for (let at = 0; at < quantity; at += 1) {
-      const cells = {
-        decimal: h("td", { role: "cell" }),
-        hex: h("td", { role: "cell" }),
-        binary: h("td", { role: "cell", class: "binary" }),
-      };
-      if (at % width === 0) {
-        cells.typed = h("td", { role: "cell", class: "typed", rowSpan: width, "data-type": type.name });
-      }
-      this.shown.set(at, cells);
-      body.append(h("tr", { role: "row", "data-address": address + at },
-        h("th", { role: "rowheader", scope: "row" },
-          String(address + at), h("span", { class: "modicon" }, modicon(area, address + at))),
-        cells.decimal, cells.hex, cells.binary, cells.typed, this.buttons(at)));
-    }
-    const head = ["Address", "Decimal", "Hex", "Binary", type.name, ""].map((text) =>
-      h("th", { role: "columnheader", scope: "col" }, text || h("span", { class: "unseen" }, "Actions")));
-    return h("table", { role: "table", class: "values", "aria-label": this.part.title },
-      h("thead", { role: "rowgroup" }, h("tr", { role: "row" }, head)), body);
+    const head = ["Address", "Decimal", "Hex", "Binary", this.part.type.name];
+    return this.frame("values", head, this.cells().map((address, at) => this.row(address, at)));
   }
 
-  buttons(at) {
-    const address = this.part.address + at;
-    const button = (text, label, onclick, kind = "") =>
-      h("button", { class: `quiet ${kind}`, type: "button", "aria-label": `${label} ${address}`, onclick }, text);
+  row(address, at) {
+    const { width, type, area } = this.part;
+    const cells = {
+      decimal: h("td", { role: "cell" }),
+      hex: h("td", { role: "cell" }),
+      binary: h("td", { role: "cell", class: "binary" }),
+    };
+    if (at % width === 0) {
+      cells.typed = h("td", { role: "cell", class: "typed", rowSpan: width, "data-type": type.name });
+    }
+    this.shown.set(at, cells);
+    return h("tr", { role: "row", "data-address": address },
+      h("th", { role: "rowheader", scope: "row" }, String(address), h("span", { class: "modicon" }, modicon(area, address))),
+      cells.decimal, cells.hex, cells.binary, cells.typed, this.buttons(address, at));
+  }
+
+  buttons(address, at) {
+    const button = (text, label, onclick, kind) => quiet(text, `${label} ${address}`, onclick, kind);
     const { write, plot } = this.actions;
     return h("td", { role: "cell", class: "do" },
       button("Types", "All types from", () => this.showTypes(at)),

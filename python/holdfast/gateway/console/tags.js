@@ -1,6 +1,6 @@
 // The table of the tags of a list.
 
-import { h } from "./dom.js";
+import { h, quiet } from "./dom.js";
 import { Panel } from "./panel.js";
 import { functionOf, placed } from "./parts.js";
 
@@ -13,22 +13,13 @@ export class TagTable extends Panel {
     this.actions = actions;
     this.places = new Map(tags.map((tag, index) => [tag.name, index]));
     this.rows = [];
-    this.fill(this.table());
-  }
-
-  table() {
-    const body = h("tbody", { role: "rowgroup" }, this.tags.map((tag) => this.row(tag)));
-    const head = ["Name", "Value", "Unit", "Place", ""].map((text) =>
-      h("th", { role: "columnheader", scope: "col" }, text || h("span", { class: "unseen" }, "Actions")));
-    return h("table", { role: "table", class: "values tags", "aria-label": this.part.title },
-      h("thead", { role: "rowgroup" }, h("tr", { role: "row" }, head)), body);
+    this.fill(this.frame("values tags", ["Name", "Value", "Unit", "Place"], tags.map((tag) => this.row(tag))));
   }
 
   row(tag) {
     const value = h("td", { role: "cell", class: "typed" });
     this.rows.push(value);
-    const button = (text, onclick, kind = "") =>
-      h("button", { class: `quiet ${kind}`, type: "button", "aria-label": `${text} ${tag.name}`, onclick }, text);
+    const button = (text, onclick, kind) => quiet(text, `${text} ${tag.name}`, onclick, kind);
     const { write, plot } = this.actions;
     const flaw = !tag.writable ? "writable is not true in the tag list" : typeof tag.scale !== "number" ? "its scale is in a register" : null;
     return h("tr", { role: "row", "data-tag": tag.name },

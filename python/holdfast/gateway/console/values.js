@@ -2,7 +2,7 @@
 
 import { notice, Problem } from "./api.js";
 import { save, stamp } from "./csv.js";
-import { $, h, pause, say, show, stopwatch } from "./dom.js";
+import { $, h, pause, quiet, say, show, stopwatch } from "./dom.js";
 import { Lists } from "./lists.js";
 import { flaw, modicon, typeOf } from "./numbers.js";
 import * as pageUrl from "./page_url.js";
@@ -213,10 +213,8 @@ export class Values {
 
   /** Shows the parts of the view. */
   chips() {
-    const items = this.pinned.map((part) => {
-      const label = `Remove ${part.title} from the view`;
-      return h("li", {}, part.title, h("button", { class: "quiet", type: "button", "aria-label": label, onclick: () => this.unpin(part) }, "✕"));
-    });
+    const items = this.pinned.map((part) =>
+      h("li", {}, part.title, quiet("✕", `Remove ${part.title} from the view`, () => this.unpin(part))));
     $("parts").replaceChildren(...items);
     $("parts").hidden = $("parts-help").hidden = items.length === 0;
   }
