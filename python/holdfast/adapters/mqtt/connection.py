@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from holdfast.adapters.mqtt.deliveries import Deliveries, NotTaken
 from holdfast.adapters.mqtt.inbox import MAX_PAYLOAD_BYTES
@@ -41,14 +41,6 @@ _READ_BYTES = 65_536
 _PUBLISH, _PUBREL, _PINGRESP = 0x30, 0x60, 0xD0
 
 
-class _Pending(NamedTuple):
-    """An answer that waits until the broker has acknowledged others."""
-
-    topic: str
-    payload: bytes
-    properties: Properties
-
-
 class BrokerConnection(BrokerClient):
     """One connection, from dialing to its end. A reconnect creates a new object."""
 
@@ -78,7 +70,8 @@ class BrokerConnection(BrokerClient):
         """Whether there may be something in `_arrived`."""
         self._most_on_the_way = _MAX_UNACKNOWLEDGED
         self._on_the_way: set[int] = set()
-        self._waiting: deque[_Pending] = deque()
+        self._waiting: deque[tuple[str, bytes, Properties]] = deque()
+        """Topic, payload and properties of answers that wait until others are acknowledged."""
         self.on_publish = self._send_waiting
 
     @property
@@ -112,7 +105,7 @@ class BrokerConnection(BrokerClient):
         if not qos:
             self.publish(topic, payload, 0, properties=properties)
             return
-        self._waiting.append(_Pending(topic, payload, properties))
+        self._waiting.append((topic, payload, properties))
         self._send_waiting()
 
     def _send_waiting(

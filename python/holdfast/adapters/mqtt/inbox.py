@@ -34,16 +34,12 @@ MAX_VALUE_BYTES = 4096
 """The largest payload of a topic with plain values, in bytes: longer than the text of any tag."""
 
 
-class BadValue(Exception):
+class BadValue(Refused):
     """A payload that is no value of its tag.
 
     `where` is the place in memory, the tag, the payload as text with a limited length, and the
     cause.
     """
-
-    def __init__(self, detail: str, where: dict[str, Any]) -> None:
-        super().__init__(detail)
-        self.where = where
 
 
 class Value:
@@ -76,7 +72,7 @@ class Value:
         assert isinstance(scale, int | float), "a map has no tag whose scale is in a register"
         step = {"step": abs(scale)} if self._tag.is_stepped else {}
         where = {**self._where, "tag": self._tag.name, "value": shown, **step, "cause": cause}
-        return BadValue(f"{self._tag.name}: {cause}", where)
+        return BadValue("invalid_value", f"{self._tag.name}: {cause}", **where)
 
 
 MAX_PAYLOAD_BYTES = 8 * 2**20
@@ -132,7 +128,7 @@ class Inbox:
                 return self._memory_access.ingest(payload, grant, peer, stale=stale).answer()
             self._memory_access.refuse(refused, grant.name, peer)
         except BadValue as error:
-            refused = Refused("invalid_value", str(error), **error.where)
+            refused = error
             self._memory_access.refuse(refused, grant.name, peer, throttle=self.bad_values)
         except Refused as error:
             refused = error
