@@ -37,7 +37,7 @@ class Answers:
         """Answers a message, if it has a response topic."""
         if message.response_topic is None:
             return
-        if self._try_send(link, message, message.response_topic, answer):
+        if self._try_send(link, message, answer):
             self.sent += 1
         else:
             self.dropped += 1
@@ -47,20 +47,13 @@ class Answers:
         return topic in self._values or self._filters.grant(topic) is not None
 
     def _try_send(
-        self,
-        link: BrokerConnection,
-        message: Publish,
-        response_topic: bytes,
-        answer: Mapping[str, object],
+        self, link: BrokerConnection, message: Publish, answer: Mapping[str, object]
     ) -> bool:
-        try:
-            topic = response_topic.decode()
-        except UnicodeDecodeError:
-            return False
-        if not topic or set(topic) & set("+#\0") or self._is_ours(topic):
+        topic = message.answer_topic
+        if topic is None or self._is_ours(topic):
             return False
         payload = msgspec.json.encode(answer)
-        size = len(payload) + len(response_topic) + len(message.correlation or b"")
+        size = len(payload) + len(topic.encode()) + len(message.correlation or b"")
         if link.connection.unsent >= MAX_WAITING_ANSWERS or not link.takes(size):
             return False
         qos = min(message.qos, 1, link.most_qos)

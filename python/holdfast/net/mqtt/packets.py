@@ -84,6 +84,15 @@ class Publish(NamedTuple):
             return "retained"
         return "delivered again" if self.is_repeated else self.lateness
 
+    @property
+    def answer_topic(self) -> str | None:
+        """The response topic as text; `None` without one to which a message can be published."""
+        try:
+            topic = (self.response_topic or b"").decode()
+        except UnicodeDecodeError:
+            return None
+        return topic if topic and not set(topic) & set("+#\0") else None
+
 
 def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: bool) -> Publish:
     """Parses a PUBLISH packet of MQTT 5 or 3.1.1. `length` is the size of the uncut body.

@@ -138,17 +138,13 @@ class Commands(CommandOutcomes):
 
     def _answer(self, message: Publish, payload: bytes) -> Message | None:
         """The reply: to the response topic of MQTT 5, or beside the command."""
-        properties = NO_PROPERTIES
-        topic = f"{message.topic}/{REPLY}"
-        if message.response_topic is not None:
-            try:
-                topic = message.response_topic.decode()
-            except UnicodeDecodeError:
-                return None
-            if not topic or set(topic) & set("+#\0") or topic in self._tags:
-                return None
-            if message.correlation is not None:
-                packed = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
-                packed.CorrelationData = message.correlation
-                properties = packed.pack()  # type: ignore[no-untyped-call]
+        if message.response_topic is None:
+            return Message(packed_topic(f"{message.topic}/{REPLY}"), payload)
+        topic, properties = message.answer_topic, NO_PROPERTIES
+        if topic is None or topic in self._tags:
+            return None
+        if message.correlation is not None:
+            packed = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+            packed.CorrelationData = message.correlation
+            properties = packed.pack()  # type: ignore[no-untyped-call]
         return Message(packed_topic(topic), payload, properties=properties)
