@@ -64,8 +64,6 @@ NONE = "None"
 
 ORIGIN = {"name": "Holdfast", "sw_version": __version__}
 
-_NOT_SHOWN = ("bytes",)
-
 
 class Discovery:
     """The discovery messages of an output."""
@@ -124,7 +122,7 @@ class Discovery:
                 **of,
             }
             for tag in tags[device]:
-                if tag.of_type.count is not None or tag.of_type.base in _NOT_SHOWN:
+                if tag.of_type.count is not None or tag.of_type.base == "bytes":
                     continue
                 component, own = self._entity(device, tag)
                 place = f"{escaped}--{_escaped(tag.name)}"

@@ -100,13 +100,10 @@ def _with_digits(tag: Tag, value: Any) -> Any:
 
 
 def _single(number: int) -> Callable[[Any], Any]:
-    if number in (2, INT32):
-        return lambda value: value & 0xFFFFFFFF
-    if number == INT64:
-        return lambda value: value & 0xFFFFFFFFFFFFFFFF
-    if number == DOUBLE:
-        return _double
-    return lambda value: value
+    if number in _SIGNED:  # The fields of integers have no sign.
+        mask = (1 << _INTEGER_FIELDS[_BASES[number].field]) - 1
+        return lambda value: value & mask
+    return _double if number == DOUBLE else lambda value: value
 
 
 def _packer(array: int) -> Callable[[Any], bytes]:
