@@ -1,6 +1,9 @@
 """One connection to a broker: paho's client, but messages are received here.
 
-- A message that a memory can't keep at the moment ends the connection.
+- A message is acknowledged after it was written, with every quality of service. With QoS 2 paho
+  sends PUBREC before it delivers the message, so a crash between the two would lose the message.
+- A message that a memory can't keep at the moment is not acknowledged, and ends the connection:
+  the broker sends it again after a reconnect.
 - The properties of a message are parsed here, in linear time.
 - A packet over the size limit is not kept in memory while it arrives.
 """
@@ -11,11 +14,11 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
-from holdfast.adapters.mqtt.deliveries import Deliveries, NotTaken
 from holdfast.adapters.mqtt.inbox import MAX_PAYLOAD_BYTES
 from holdfast.adapters.mqtt.sessions import SESSION_EXPIRY_S
+from holdfast.ingest import KEEPING
 from holdfast.net.mqtt.client import BrokerClient
-from holdfast.net.mqtt.packets import MAX_HEAD_BYTES
+from holdfast.net.mqtt.packets import MAX_HEAD_BYTES, acknowledgement, parse_publish
 from holdfast.net.mqtt.stream import Packets
 
 if TYPE_CHECKING:
@@ -38,7 +41,7 @@ _MAX_UNACKNOWLEDGED = 20
 
 _READ_BYTES = 65_536
 
-_PUBLISH, _PUBREL, _PINGRESP = 0x30, 0x60, 0xD0
+_PUBLISH, _PUBACK, _PUBREC, _PUBREL, _PUBCOMP, _PINGRESP = 0x30, 0x40, 0x50, 0x60, 0x70, 0xD0
 
 
 class BrokerConnection(BrokerClient):
@@ -57,8 +60,7 @@ class BrokerConnection(BrokerClient):
         `answer` is called for each message, after its acknowledgement.
         """
         super().__init__(settings, settings.client_id, waiter, session_expiry=SESSION_EXPIRY_S)
-        self._deliveries = Deliveries(inbox, unreleased, five=self._five)
-        self._answer = answer
+        self._inbox, self._unreleased, self._answer = inbox, unreleased, answer
         self._largest_sent: int | None = None
         self.most_qos = 1
         """The highest quality of service that the broker accepts, at most 1."""
@@ -151,17 +153,48 @@ class BrokerConnection(BrokerClient):
         if first & 0xF0 == _PUBLISH:
             self._take(first, body, size)
         elif first & 0xF0 == _PUBREL:
-            self.connection.put(self._deliveries.release(body))
+            self._release(body)
         else:
             self.pass_on(first, body)
 
     def _take(self, first: int, body: bytes | bytearray, size: int) -> None:
+        """Writes the message of a PUBLISH packet, and acknowledges it."""
         try:
-            taken = self._deliveries.take(first, body, size)
-        except NotTaken as error:
-            self.end(str(error))
+            message = parse_publish(first, body, size, five=self._five)
+        except ValueError as error:
+            self.end(f"malformed message: {error}")
             return
-        if taken.acknowledgement:
-            self.connection.put(taken.acknowledgement)
-        if taken.result is not None and self.connection.failure is None:
-            self._answer(self, taken.message, taken.result)
+        is_known = message.qos == 2 and message.identifier in self._unreleased
+        result = {} if is_known else self._inbox.take(message, stale=_staleness(message))
+        if message.qos and result.get("reason") in KEEPING:
+            self.end(str(result["detail"]))
+            return
+        # Before the answer: if the broker closes the connection because of that, it does not
+        # deliver the message again.
+        if message.qos == 1:
+            self.connection.put(acknowledgement(_PUBACK, message.identifier))
+        elif message.qos == 2:
+            self._unreleased.add(message.identifier)
+            self.connection.put(acknowledgement(_PUBREC, message.identifier))
+        if not is_known and self.connection.failure is None:
+            self._answer(self, message, result)
+
+    def _release(self, body: bytes | bytearray) -> None:
+        """Answers a PUBREL packet. Raises `ValueError`."""
+        if len(body) < 2:
+            raise ValueError("a PUBREL packet without identifier")
+        identifier = int.from_bytes(body[:2])
+        self._unreleased.discard(identifier)
+        self.connection.put(acknowledgement(_PUBCOMP, identifier))
+
+
+def _staleness(message: Publish) -> str | None:
+    """Why a message may be old.
+
+    `None` if nothing says so: what the broker has kept for a session looks like any new message.
+    """
+    if message.is_retained:
+        return "the message is retained, so its command may be old"
+    if message.is_repeated:
+        return "the broker delivers the message again, and its command may be carried out already"
+    return None
