@@ -55,9 +55,9 @@ class Failed(RequestError):
 class _RequestClient(Client):
     """A client for the calls of one HTTP request, on a connection with other users."""
 
-    def __init__(self, turns: Turns, timeout: float) -> None:
+    def __init__(self, turns: Turns, unit: int, timeout: float) -> None:
         # It has no connection of its own, which the constructor of its base would create.
-        self.target, self.unit, self.timeout = turns.target, 1, timeout
+        self.target, self.unit, self.timeout = turns.target, unit, timeout
         self._transport = turns
 
 
@@ -123,7 +123,7 @@ class RequestedDevice:
         def run(given: Turns) -> Awaitable[Result]:
             nonlocal turns
             turns = given
-            return call(_RequestClient(turns, self.timeout))
+            return call(_RequestClient(turns, self.unit, self.timeout))
 
         try:
             async with asyncio.timeout(self.timeout):

@@ -109,7 +109,7 @@ async def _require_reply(survey: Survey, device: RequestedDevice) -> None:
     for found in areas:
         try:
             kind = "bool" if found.area in BIT_AREAS else "uint16"
-            await device.ask(_read(device, found.area, survey.span.start, kind))
+            await device.ask(_read(found.area, survey.span.start, kind))
         except ModbusException:  # An exception is a response: the device is reachable.
             pass
         except Failed as error:
@@ -123,7 +123,7 @@ async def _run(survey: Survey, device: RequestedDevice, longest: float) -> Faile
     """Carries out a survey. Returns why it ended early, or `None`."""
     try:
         async with asyncio.timeout(longest):
-            await address_search.run(survey, lambda *place: device.attempt(_read(device, *place)))
+            await address_search.run(survey, lambda *place: device.attempt(_read(*place)))
     except TimeoutError:
         return Failed("unfinished", f"not finished within {longest:g} s")
     except ModbusError as error:
@@ -136,9 +136,9 @@ async def _run(survey: Survey, device: RequestedDevice, longest: float) -> Faile
     return None
 
 
-def _read(device: RequestedDevice, area: Area, address: int, kind: str) -> Call:
+def _read(area: Area, address: int, kind: str) -> Call:
     """Returns a read, for `ask` or `attempt`."""
-    return lambda client: client.read(area, address, kind, unit=device.unit)
+    return lambda client: client.read(area, address, kind)
 
 
 def _progress(survey: Survey, findings: Sequence[Finding]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ MAX_WORDS = (MAX_PDU - 3) // 2
 
 async def _diagnostics(given: Given, device: RequestedDevice) -> Answer:
     number, words = given["subFunction"], given["data"]
-    found = await device.ask(lambda client: client.diagnostics(number, words, unit=device.unit))
+    found = await device.ask(lambda client: client.diagnostics(number, words))
     return {"subFunction": number, "data": found}
 
 

@@ -23,24 +23,20 @@ _PLACE = {_FILE.name: _FILE.schema, _RECORD.name: _RECORD.schema}
 async def _read(given: Given, device: RequestedDevice) -> Answer:
     file, record, quantity = given["file"], given["record"], given["quantity"]
     _check_end(record, quantity)
-    found = await device.ask(
-        lambda client: client.read_file_record(file, record, quantity, unit=device.unit)
-    )
+    found = await device.ask(lambda client: client.read_file_record(file, record, quantity))
     return {"file": file, "record": record, "values": found}
 
 
 async def _write(given: Given, device: RequestedDevice) -> Answer:
     file, record, values = given["file"], given["record"], given["values"]
     _check_end(record, len(values))
-    await device.ask(
-        lambda client: client.write_file_record(file, record, values, unit=device.unit)
-    )
+    await device.ask(lambda client: client.write_file_record(file, record, values))
     return {"file": file, "record": record, "quantity": len(values)}
 
 
 async def _queue(given: Given, device: RequestedDevice) -> Answer:
     address = given["address"]
-    found = await device.ask(lambda client: client.read_fifo_queue(address, unit=device.unit))
+    found = await device.ask(lambda client: client.read_fifo_queue(address))
     return {"address": address, "values": found}
 
 

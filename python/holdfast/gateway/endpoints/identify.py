@@ -20,7 +20,7 @@ _HEX = {"type": "string", "pattern": "^([0-9a-f]{2})*$"}
 
 
 async def _server_id(_: Given, device: RequestedDevice) -> Answer:
-    found = await device.ask(lambda client: client.report_server_id(unit=device.unit))
+    found = await device.ask(lambda client: client.report_server_id())
     return {
         "serverId": found.server_id,
         "running": found.running,
@@ -30,7 +30,7 @@ async def _server_id(_: Given, device: RequestedDevice) -> Answer:
 
 
 async def _identify(_: Given, device: RequestedDevice) -> Answer:
-    found = await device.ask(lambda client: client.identify(unit=device.unit))
+    found = await device.ask(lambda client: client.identify())
     names = {key: getattr(found, name) for name, key in _NAMES.items()}
     objects = {str(number): data.hex() for number, data in sorted(found.objects.items())}
     return {**names, "conformityLevel": found.conformity_level, "objects": objects}

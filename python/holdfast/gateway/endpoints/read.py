@@ -28,9 +28,6 @@ from holdfast.protocol import (
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
-
-    from holdfast.client import Client
     from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Answer, Given
     from holdfast.gateway.endpoints.typed import Typed
@@ -95,20 +92,16 @@ class Range:
 
     async def read(self, device: RequestedDevice) -> list[Any]:
         """Reads the values: booleans, or integers 0 to 65535."""
-
-        def call(client: Client) -> Awaitable[list[Any]]:
-            read: Callable[..., Awaitable[list[Any]]] = getattr(client, f"read_{self.area}")
-            return read(self.address, self.quantity, unit=device.unit)
-
-        return await device.ask(call)
+        found: list[Any] = await device.ask(
+            lambda client: getattr(client, f"read_{self.area}")(self.address, self.quantity)
+        )
+        return found
 
 
 async def _connect(_: Given, device: RequestedDevice) -> Answer:
     answer = {"message": "Modbus server reachable", **device.target_fields}
     try:
-        [register] = await device.ask(
-            lambda client: client.read_holding_registers(0, 1, unit=device.unit)
-        )
+        [register] = await device.ask(lambda client: client.read_holding_registers(0, 1))
     except ModbusException as error:
         answer["message"] += " (responded with exception)"
         return {**answer, "exception": exception_name(error)}

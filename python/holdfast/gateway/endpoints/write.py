@@ -38,37 +38,33 @@ ON = 0xFF00
 
 async def _write_coil(given: Given, device: RequestedDevice) -> Answer:
     address, value = given["address"], bool(given["value"])
-    await device.ask(lambda client: client.write_coil(address, value, unit=device.unit))
+    await device.ask(lambda client: client.write_coil(address, value))
     return {"address": address, "coilValue": ON if value else 0, "written": value}
 
 
 async def _write_coils(given: Given, device: RequestedDevice) -> Answer:
     address, values = given["address"], [bool(each) for each in given["values"]]
     check_end(address, len(values))
-    await device.ask(lambda client: client.write_coils(address, values, unit=device.unit))
+    await device.ask(lambda client: client.write_coils(address, values))
     return {"startAddress": address, "quantity": len(values)}
 
 
 async def _write_register(given: Given, device: RequestedDevice) -> Answer:
     address, value = given["address"], given["value"]
-    await device.ask(lambda client: client.write_register(address, value, unit=device.unit))
+    await device.ask(lambda client: client.write_register(address, value))
     return {"address": address, "value": value}
 
 
 async def _write_registers(given: Given, device: RequestedDevice) -> Answer:
     address, values = given["address"], _registers(given)
     check_end(address, len(values))
-    await device.ask(lambda client: client.write_registers(address, values, unit=device.unit))
+    await device.ask(lambda client: client.write_registers(address, values))
     return {"startAddress": address, "quantity": len(values)}
 
 
 async def _mask(given: Given, device: RequestedDevice) -> Answer:
     address, and_mask, or_mask = given["address"], given["andMask"], given["orMask"]
-    await device.ask(
-        lambda client: client.mask_write(
-            address, and_mask=and_mask, or_mask=or_mask, unit=device.unit
-        )
-    )
+    await device.ask(lambda client: client.mask_write(address, and_mask=and_mask, or_mask=or_mask))
     return {"address": address, "andMask": and_mask, "orMask": or_mask}
 
 
@@ -77,9 +73,7 @@ async def _read_write(given: Given, device: RequestedDevice) -> Answer:
     address, values = given["writeAddress"], given["values"]
     check_end(first, quantity)
     check_end(address, len(values))
-    found = await device.ask(
-        lambda client: client.read_write(first, quantity, address, values, unit=device.unit)
-    )
+    found = await device.ask(lambda client: client.read_write(first, quantity, address, values))
     return {
         "writeAddress": address,
         "written": len(values),

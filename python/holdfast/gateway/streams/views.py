@@ -105,9 +105,7 @@ class _TagsPart:
 
     async def read(self, device: RequestedDevice) -> _State:
         def fetch(area: Area, address: int, count: int) -> Any:
-            return device.attempt(
-                lambda client: _fetched(client, device.unit, area, address, count)
-            )
+            return device.attempt(lambda client: _fetched(client, area, address, count))
 
         readings = await self._reader.read_with(fetch)
         silence = readings[0].error
@@ -123,13 +121,13 @@ class _TagsPart:
 _Part: TypeAlias = _RangePart | _TagsPart
 
 
-async def _fetched(client: Client, unit: int, area: Area, address: int, count: int) -> bytes:
+async def _fetched(client: Client, area: Area, address: int, count: int) -> bytes:
     """The bytes of a block, as in a Modbus reply."""
     if area not in BIT_AREAS:
-        registers: bytes = await client.read(area, address, f"bytes:{2 * count}", unit=unit)
+        registers: bytes = await client.read(area, address, f"bytes:{2 * count}")
         return registers
     read = client.read_coils if area == "coils" else client.read_discrete_inputs
-    return packed(await read(address, count, unit=unit))
+    return packed(await read(address, count))
 
 
 def _is_answer(reading: Reading) -> bool:
