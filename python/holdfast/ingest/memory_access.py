@@ -28,7 +28,7 @@ from holdfast.ingest.refusals import (
     Refused,
     malformed,
     place_of,
-    prefix,
+    refusal,
     shown,
     unreadable,
     unrecorded,
@@ -481,21 +481,19 @@ class MemoryAccess:
         memory, area, address = command["memory"], command["area"], command["address"]
         if type(memory) is not str or type(area) is not str or type(address) is not int:
             raise malformed(index, _type_wrong(command))
+        place = index, memory, area, address
         restores = bool(grant.while_sealed) and self._restores(memory, area, grant)
         if restores:
             target = self.memories[memory]
         else:
             target = self._granted(memory, area, address, grant, index)
         if not grant.writes:
-            where = place_of(index, memory, area, address)
-            raise Refused("not_granted", f"{grant.name} may not write", **where)
+            raise Refused("not_granted", f"{grant.name} may not write", **place_of(*place))
         if "bools" in command and area not in BIT_AREAS:
-            where = place_of(index, memory, area, address)
-            raise malformed(index, f"bools are only for bits; {area} has registers", where)
+            raise refusal("malformed", f"bools are only for bits; {area} has registers", place)
         values = values_of(command)
         if type(values) is not list:
-            where = place_of(index, memory, area, address)
-            raise malformed(index, f"values are {shown(values)}, not an array", where)
+            raise refusal("malformed", f"values are {shown(values)}, not an array", place)
         write = (target, area, address, values)
         return (*write, True) if restores else write
 
@@ -515,17 +513,14 @@ class MemoryAccess:
         target = self.memories.get(memory)
         if target is not None and memory in grant.memories and area in grant.areas:
             return target
-        of, where = prefix(index), place_of(index, memory, area, address)
+        reason, detail = "not_granted", f"area {area} is not granted to {grant.name}"
         if target is None:
-            raise Refused("unknown_memory", f"{of}no memory {shown(memory)}", **where)
-        if memory not in grant.memories:
+            reason, detail = "unknown_memory", f"no memory {shown(memory)}"
+        elif memory not in grant.memories:
             detail = f"memory {memory} is not granted to {grant.name}"
         elif area not in AREAS:
-            detail = f"area is {shown(area)}, allowed: {', '.join(AREAS)}"
-            raise Refused("invalid_area", f"{of}{detail}", **where)
-        else:
-            detail = f"area {area} is not granted to {grant.name}"
-        raise Refused("not_granted", f"{of}{detail}", **where)
+            reason, detail = "invalid_area", f"area is {shown(area)}, allowed: {', '.join(AREAS)}"
+        raise refusal(reason, detail, (index, memory, area, address))
 
     def _refused(
         self,
@@ -536,37 +531,39 @@ class MemoryAccess:
     ) -> Refused:
         """Converts a refusal of native code. Raises it again if no command can cause it."""
         memory, area, address = command["memory"], command["area"], command["address"]
-        values, where = values_of(command), place_of(index, memory, area, address)
+        values, place = values_of(command), (index, memory, area, address)
         match refused.reason:
             case "empty":
-                return malformed(index, "values are empty", where)
+                return refusal("malformed", "values are empty", place)
             case "out_of_range":
                 return self._out_of_range(memory, area, address, len(values), index)
             case "mirrored":
-                found = f"{prefix(index)}{len(values)} from address {shown(address)} of {area}"
+                found = f"{len(values)} from address {shown(address)} of {area}"
                 detail = f"{found} overlap a range that mirrors a device"
-                return Refused("mirrored", detail, **where)
+                return refusal("mirrored", detail, place)
             case "unsealed":
-                detail = f"{prefix(index)}{_not_sealed(command, grant)}"
-                return Refused("not_granted", detail, **where)
+                return refusal("not_granted", _not_sealed(command, grant), place)
             case "stale":
-                detail = f"{prefix(index)}a range mirrors a device, and its values are too old"
-                return Refused("stale", detail, **where)
+                detail = "a range mirrors a device, and its values are too old"
+                return refusal("stale", detail, place)
             case "not_one_step":
-                detail = f"{prefix(index)}{memory} and the memories before it are not kept together"
-                return Refused("not_one_step", f"{detail}, so no step writes all of them", **where)
+                detail = f"{memory} and the memories before it are not kept together"
+                detail += ", so no step writes all of them"
+                return refusal("not_one_step", detail, place)
             case "too_large":
-                return Refused("too_large", f"{refused.detail}; nothing has changed", **where)
+                detail = f"{refused.detail}; nothing has changed"
+                return Refused("too_large", detail, **place_of(*place))
             case reason if reason in KEEPING:
-                return Refused(reason, KEEPING[reason], **where)
+                return Refused(reason, KEEPING[reason], **place_of(*place))
             case "invalid_value" | "invalid_type" if refused.index is not None:
                 value = shown(values[refused.index])
                 wrong = "outside" if refused.reason == "invalid_value" else "not"
                 allowed = f"{wrong} 0..{MAX_WORD}"
                 if area in BIT_AREAS:
                     allowed = "not 0, 1, false or true"
-                detail = f"{prefix(index)}values[{refused.index}] is {value}, {allowed}"
-                return Refused("invalid_value", detail, index=refused.index, value=value, **where)
+                detail = f"values[{refused.index}] is {value}, {allowed}"
+                at = refused.index
+                return refusal("invalid_value", detail, place, index=at, value=value)
             case _:
                 raise refused
 
@@ -580,9 +577,8 @@ class MemoryAccess:
             allowed = f"allowed: 1 to {addresses.stop - address}"
         else:
             allowed = f"allowed: addresses {addresses.start} to {addresses.stop - 1}"
-        found = f"{prefix(index)}{count} from address {shown(address)} of {area}"
-        where = place_of(index, memory, area, address)
-        return Refused("out_of_range", f"{found}, {allowed}", **where)
+        found = f"{count} from address {shown(address)} of {area}, {allowed}"
+        return refusal("out_of_range", found, (index, memory, area, address))
 
 
 def _set_outcome(

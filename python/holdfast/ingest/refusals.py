@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 
@@ -11,6 +11,9 @@ from holdfast.runtime.text import clip
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+Place: TypeAlias = tuple[int | None, str, str, int]
+"""The index of a command in its batch, if it has one, and the memory, area and address."""
 
 MAX_SHOWN = 40
 """The characters of a name or a value of a command that are shown."""
@@ -55,7 +58,7 @@ def unreadable(error: OSError) -> str:
     return "stale" if isinstance(error, _core.Stale) else "log_unavailable"
 
 
-def prefix(index: int | None) -> str:
+def _prefix(index: int | None) -> str:
     """Returns the beginning of a text about a command of a batch."""
     return "" if index is None else f"commands[{index}]: "
 
@@ -76,11 +79,15 @@ def unrecorded(where: Mapping[str, Any]) -> Refused:
     return Refused("unrecorded", detail, **where)
 
 
-def malformed(index: int | None, detail: str, where: Mapping[str, Any] | None = None) -> Refused:
-    """A refusal of a command whose form is wrong."""
-    if where is None:
-        where = {} if index is None else {"command": index}
-    return Refused("malformed", f"{prefix(index)}{detail}", **where)
+def malformed(index: int | None, detail: str) -> Refused:
+    """A refusal of a command whose target could not be parsed."""
+    where = {} if index is None else {"command": index}
+    return Refused("malformed", f"{_prefix(index)}{detail}", **where)
+
+
+def refusal(reason: str, detail: str, place: Place, **more: Any) -> Refused:
+    """A refusal of a command, sent alone or in a batch. `more` is what else says where."""
+    return Refused(reason, f"{_prefix(place[0])}{detail}", **more, **place_of(*place))
 
 
 def shown(value: object) -> str:
