@@ -204,7 +204,7 @@ class Stored:
                     raise _Damage(f"row {id} is behind row {last}")
                 if crc32(data, count) != checksum:
                     raise ValueError("the row is not the one that was stored")
-                readings = [self._reading(*plain) for plain in _decoded(data)]
+                readings = [self._reading(plain) for plain in _decoded(data)]
             except sqlite3.Error as error:
                 if found:
                     return found
@@ -318,16 +318,9 @@ class Stored:
             return FileGone(f"{error}; it can't become {aside}: {failed}", lost, stays=True)
         return FileGone(f"{error}; it is {aside} now", lost)
 
-    def _reading(
-        self,
-        device: str,
-        name: str,
-        value: Any,
-        time: float,
-        fault: int,
-        undecoded: str | None,
-        meaning: int,
-    ) -> Reading:
+    def _reading(self, plain: Sequence[Any]) -> Reading:
+        """A reading that `add` has stored. Raises `TypeError` or `ValueError` for anything else."""
+        device, name, value, time, fault, undecoded, meaning = plain
         tag = self._find(device, name)
         if tag is None or meaning != crc32(described(tag).encode()):
             tag = self._as_stored(name, meaning)
