@@ -18,13 +18,7 @@ from holdfast.gateway.fields import (
 )
 from holdfast.net.http.fields import Field, malformed, value_text
 from holdfast.net.http.schemas import TEXT, Schema, array_of, integer, map_of
-from holdfast.protocol import (
-    MAX_WORD,
-    READ_BITS,
-    READ_FUNCTIONS,
-    READ_LIMITS,
-    READ_REGISTERS,
-)
+from holdfast.protocol import MAX_WORD, READ_BITS, READ_FUNCTIONS, READ_LIMITS, READ_REGISTERS
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -169,11 +163,7 @@ ENDPOINTS = (
         fields=RANGE,
         carry_out=_read,
         has_rtt=False,
-        properties={
-            "functionCode": FUNCTION_SCHEMA,
-            "functionName": TEXT,
-            **RANGE_PROPERTIES,
-        },
+        properties={"functionCode": FUNCTION_SCHEMA, "functionName": TEXT, **RANGE_PROPERTIES},
         optional=tuple(TYPED),
         examples={
             "Five registers": {**EXAMPLE, "functionCode": 3, "address": 100, "quantity": 5},

@@ -20,12 +20,7 @@ from holdfast.gateway.fields import (
 )
 from holdfast.net.http.fields import Field
 from holdfast.net.http.schemas import BOOLEAN, Schema, array, integer
-from holdfast.protocol import (
-    MAX_WORD,
-    READ_WRITE,
-    WRITE_BITS,
-    WRITE_REGISTERS,
-)
+from holdfast.protocol import MAX_WORD, READ_WRITE, WRITE_BITS, WRITE_REGISTERS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
