@@ -168,16 +168,14 @@ class Pool:
                 turns = await self._shared.turns(target, timeout)
                 if turns is not None:
                     return await call(turns)
-        addresses = route.allowed
-        if len(addresses) > 1:
-            addresses = tuple(sorted(addresses, key=lambda each: each not in self._entries))
-        for target in addresses[:-1]:
+        *earlier, last = sorted(route.allowed, key=lambda each: each not in self._entries)
+        for target in earlier:
             try:
                 return await self._run(target, call)
             except ConnectionLost as error:
                 if error.maybe_sent:
                     raise
-        return await self._run(addresses[-1], call)
+        return await self._run(last, call)
 
     async def _run(self, key: NetworkTarget, call: Callable[[Turns], Awaitable[Result]]) -> Result:
         device = self._entries.get(key) or await self._new_entry(key)
