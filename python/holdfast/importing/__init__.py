@@ -6,13 +6,13 @@ dropped silently. This package never starts anything, and secrets leave it only 
 
 from __future__ import annotations
 
-from holdfast.importing.home_assistant import read_home_assistant
+from holdfast.importing.home_assistant.hubs import read_home_assistant
 from holdfast.importing.imported import ORDINALS, Imported, NotImportable
-from holdfast.importing.mma import read_mma
+from holdfast.importing.mma.configuration import read_mma
 from holdfast.importing.modpoll import INTERVAL_S, read_modpoll
 from holdfast.importing.notes import Kind, Note
 from holdfast.importing.replicator import read_replicator
-from holdfast.importing.telegraf import read_telegraf
+from holdfast.importing.telegraf.configuration import read_telegraf
 
 __all__ = [
     "INTERVAL_S",
