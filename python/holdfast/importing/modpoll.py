@@ -22,6 +22,9 @@ from holdfast.importing.names import free_name, unique_names
 from holdfast.importing.notes import Desk
 from holdfast.protocol import ADDRESSES, MAX_UNIT, WRITE_LIMITS
 from holdfast.types import AREAS, REGISTER_AREAS, Area
+from holdfast.values import register_count
+from holdfast.values.digits import FLOATS
+from holdfast.values.numeric import INTEGERS
 from holdfast.values.orders import SWAPPED_BYTES
 
 if TYPE_CHECKING:
@@ -46,11 +49,7 @@ _ORDERS = {"be_be": "ABCD", "le_be": "BADC", "le_le": "DCBA", "be_le": "CDAB"}
 _OTHER_ORDER = "CDAB"
 """That of all other words."""
 
-_WIDTHS = {
-    **dict.fromkeys(("int16", "uint16", "float16"), 1),
-    **dict.fromkeys(("int32", "uint32", "float32"), 2),
-    **dict.fromkeys(("int64", "uint64", "float64"), 4),
-}
+_WIDTHS = {kind: register_count(kind) for kind in (*INTEGERS, *FLOATS)}
 _LISTS = {"bool": 1, "bool8": 1, "bool16": 2}
 """The types that are lists of bits, and how far they reach: registers, or bytes of coils."""
 

@@ -13,7 +13,9 @@ from holdfast.importing.key_reader import Section
 from holdfast.importing.names import MAX_LENGTH, free_name
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.values import encode, register_count
+from holdfast.values.digits import FLOATS
 from holdfast.values.errors import DoesNotFit
+from holdfast.values.numeric import INTEGERS
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
@@ -32,7 +34,7 @@ _AREAS: dict[str, Area] = {
 _REGISTERS = ("holding", "input")
 _BITS = ("coils", "discrete_inputs")
 
-_TYPES = ("int16", "uint16", "int32", "uint32", "int64", "uint64", "float16", "float32", "float64")
+_TYPES = (*INTEGERS, *FLOATS)
 _FORMER_TYPES = ("int", "uint", "float")
 """Types of former versions, whose `count` is their size in registers."""
 
@@ -44,7 +46,7 @@ _UTF_8 = {"encoding": "utf-8"}
 """The source decoded every text as UTF-8."""
 
 _STRUCTURE = re.compile(r"([@=<>!]?)(\d{0,3})([hHiIlLqQefds])")
-_CODES = dict(zip("hHiIqQefd", _TYPES, strict=True)) | {"l": "int32", "L": "uint32"}
+_CODES = {code: kind for kind, code in (INTEGERS | FLOATS).items()} | {"l": "int32", "L": "uint32"}
 """The types of one value of a structure, by its code."""
 
 _PREFIX = re.compile(r"^(swing_mode_)?(state_|action_)(fan_(?!only))?")

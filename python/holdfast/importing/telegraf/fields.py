@@ -14,7 +14,8 @@ from holdfast.runtime.text import listing
 from holdfast.tags.read_gap import DEFAULT_MAX_GAP
 from holdfast.types import BIT_AREAS
 from holdfast.values import register_count
-from holdfast.values.numeric import limits
+from holdfast.values.digits import FLOATS
+from holdfast.values.numeric import INTEGERS, limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -37,17 +38,10 @@ STYLES: dict[str, tuple[str, ...]] = {
 }
 """The styles, with the keys that only they have."""
 
-_TYPES = {
-    "INT16": "int16",
-    "UINT16": "uint16",
-    "INT32": "int32",
-    "UINT32": "uint32",
-    "INT64": "int64",
-    "UINT64": "uint64",
-    "FLOAT16": "float16",
-    "FLOAT32": "float32",
-    "FLOAT64": "float64",
-}
+_TYPES = {kind.upper(): kind for kind in (*INTEGERS, *FLOATS)}
+_SIZES = {name: register_count(kind) for name, kind in _TYPES.items()}
+"""Registers of a value; one of another type is in one."""
+
 _BYTES = ("INT8L", "INT8H", "UINT8L", "UINT8H")
 _INPUT_TYPES = (*_TYPES, *_BYTES, "STRING", "BIT")
 
@@ -233,7 +227,7 @@ class Fields:
             real, output = _FIXED[kind][count], "FLOAT64"
         else:
             real, output = _IEEE.get(kind, kind), "native"
-        size = register_count(_TYPES[real]) if real in _TYPES else 1
+        size = _SIZES.get(real, 1)
         if count != size:
             self._wrong_count(entry, kind, count, str(size))
             return None
@@ -312,7 +306,7 @@ class Fields:
         elif kind == "STRING":
             size = entry.integer("length", 1, LAST_ADDRESS) or 1
         else:
-            size = register_count(_TYPES[kind]) if kind in _TYPES else 1
+            size = _SIZES.get(kind or "", 1)
         return range(address, address + size)
 
     def _field(
@@ -356,7 +350,7 @@ class Fields:
             self.desk.problem(entry.at("bit"), f"found {bit}, allowed: only with BIT")
         if kind == "STRING":
             return length, length or 1
-        return None, register_count(_TYPES[kind]) if kind in _TYPES else 1
+        return None, _SIZES.get(kind or "", 1)
 
     def _bit_of_area(self, entry: Section, key: str) -> Typed:
         output = word(entry, key, ("UINT16", "BOOL"))
@@ -407,8 +401,7 @@ class Fields:
                 message = f"numbers beyond {kept} stay as they are; the source had other ones"
                 self.desk.changed(entry.at(key), message)
         settings = {"type": _TYPES[kind]}
-        small = register_count(settings["type"]) == 1
-        settings |= _order(_OF_ONE_REGISTER[order] if small else order)
+        settings |= _order(_OF_ONE_REGISTER[order] if _SIZES[kind] == 1 else order)
         becomes_float = is_float or kind == "UINT64" or not is_whole
         return settings | ({} if scale == 1 else {"scale": scale}), was_float != becomes_float
 
