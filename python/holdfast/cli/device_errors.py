@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import click
 
+from holdfast.cli import answers
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.base import MAX_TIMEOUT_S
@@ -136,7 +137,7 @@ def hint_at_late_replies(longest: float, timeout: float) -> None:
 def fail(
     error: object,
     url: str,
-    answer: Mapping[str, object] | None,
+    answer: Mapping[str, object] | None = None,
     first: str | None = None,
     *,
     where: str | None = None,
@@ -145,11 +146,11 @@ def fail(
 ) -> NoReturn:
     """Prints an error and hints, `first` before others, and exits with 1.
 
-    With `answer`, prints JSON on standard output. `where`: what to name in place of the URL.
+    `answer`: what JSON has besides, by default the URL. `where`: what to name in place of the URL.
     `is_in_area`: whether the error concerns an area, not records of a file or a queue.
     """
-    if answer is not None:
-        print_json({"ok": False, **answer, **problem(error)})
+    if answers.wanted():
+        print_json({"ok": False, **(answer or {"target": url}), **problem(error)})
         sys.exit(ExitCode.FAILED)
     click.echo(f"holdfast: {where or url}: {error}", err=True)
     if first is not None:

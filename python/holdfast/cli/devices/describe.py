@@ -149,7 +149,7 @@ def describe(
     if output is not None:
         _require_writable(output, force=force)
     with interruptions() as signals:
-        report = Report({"target": url} if as_json else None, signals)
+        report = Report({"target": url}, signals)
         most = None if everything else MAX_LINES
         plan = _Plan(settings, times, every, output, force, most)
         run = _Run(url, asked, plan, report)

@@ -62,7 +62,7 @@ def find_hosts(
             f"a second. Ctrl-C stops.",
             err=True,
         )
-    report = Report({"target": target, "port": port} if as_json else None)
+    report = Report({"target": target, "port": port})
     row = f"{{:{max(map(len, urls))}}}  {{:>4}}  {{:7}}  {{}}"
     found: list[Host] = []
     listed: list[Host] = []

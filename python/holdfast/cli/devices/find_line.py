@@ -48,7 +48,7 @@ def find_line(
         )
     attempts: list[Attempt] = []
     with interruptions() as signals:
-        report = Report({"target": path} if as_json else None, signals)
+        report = Report({"target": path}, signals)
 
         def search() -> None:
             with report.progress("Finding", total, lambda: _tried(attempts)):

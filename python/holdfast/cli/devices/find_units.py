@@ -42,7 +42,7 @@ def find_units(
         click.echo(f"{len(unit_ids)} unit ids, at most {most:.0f} s. Ctrl-C stops.", err=True)
     found: list[Unit] = []
     with interruptions() as signals:
-        report = Report({"target": url} if as_json else None, signals)
+        report = Report({"target": url}, signals)
         ignores = False
 
         def search() -> None:

@@ -92,7 +92,7 @@ def guess(
             for _ in schedule.ticks(every, times):
                 found.append(device.read_raw(client, place.area, place.address, size))
         except ModbusError as error:
-            device_errors.fail(error, url, fields if as_json else None)
+            device_errors.fail(error, url, fields)
         except ValueError as error:
             raise click.UsageError(str(error)) from error
     guesses = type_guess.guess(found, like=like, anywhere=anywhere, now=time.time())

@@ -85,7 +85,7 @@ def map_(
         click.echo(announced(survey), err=True)
     began = time.monotonic()
     with interruptions() as signals:
-        report = Report({"target": url, "unit": unit} if as_json else None, signals)
+        report = Report({"target": url, "unit": unit}, signals)
         with device.connect(url, unit, timeout) as client:
             why = _search(survey, client, settings.delay, report, url)
         seconds = time.monotonic() - began

@@ -131,15 +131,14 @@ def read(
     fields = {"target": url, "unit": unit, **query.to_json()}
     with device.connect(url, unit, timeout) as client:
         if every is not None and isinstance(query, _Query):
-            sys.exit(_again(client, url, query, fields if as_json else None, every, times))
+            sys.exit(_again(client, url, query, fields, every, times))
         try:
             raw = query.read(client)
         except ModbusError as error:
             place = query.place if isinstance(query, _Query) else None
             of_modicon = modicon_hint(place) if place and _is_absent(error) else None
-            shown = fields if as_json else None
             try:
-                device_errors.fail(error, url, shown, of_modicon, is_in_area=place is not None)
+                device_errors.fail(error, url, fields, of_modicon, is_in_area=place is not None)
             finally:  # Its hint follows the others.
                 if place and isinstance(error, RequestTimeout) and error.maybe_sent:
                     device.await_late_reply(client, place.area, place.address)
@@ -292,12 +291,12 @@ def _again(
     client: SyncClient,
     url: str,
     query: _Query,
-    fields: dict[str, object] | None,
+    fields: dict[str, object],
     every: float,
     times: int | None,
 ) -> int:
     """Reads at every tick and returns the exit code. Prints errors and continues."""
-    code = 0
+    code, as_json = 0, answers.wanted()
     lines = _Lines(query)
     try:
         for _ in schedule.ticks(every, times):
@@ -305,19 +304,19 @@ def _again(
                 raw = query.read(client)
             except ModbusError as error:
                 code = ExitCode.FAILED
-                if fields is None:
+                if as_json:
+                    print_json({"ok": False, **fields, **_now(), **device_errors.problem(error)})
+                else:
                     lines.wrong(error)
                     device_errors.hint(error, url)
-                else:
-                    print_json({"ok": False, **fields, **_now(), **device_errors.problem(error)})
                 continue
-            if fields is None:
-                lines.reading(raw)
-            else:
+            if as_json:
                 is_whole = not query.undecodable(raw)
                 print_json({"ok": is_whole, **fields, **_now(), **query.found(raw)})
+            else:
+                lines.reading(raw)
     except KeyboardInterrupt:
-        if fields is None and sys.stdout.isatty():
+        if not as_json and sys.stdout.isatty():
             click.echo()
     return code
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli import device_errors, terminal_text
+from holdfast.cli import answers, device_errors, terminal_text
 from holdfast.cli.progress import bar
 from holdfast.cli.signals import Interrupted
 from holdfast.discovery.address_search import LimitReached
@@ -53,18 +53,14 @@ NOTHING = Ended("nothing", "no device answered")
 
 
 class Report:
-    """The output of a search: lines of text; with `about`, one JSON object.
+    """The output of a search: lines of text; with `--json`, one JSON object.
 
     The object begins with `about` and a list, whose elements are the findings: each is written at
     once, on a line of its own. An interruption does not cut a line.
     """
 
-    def __init__(
-        self,
-        about: Mapping[str, object] | None,
-        signals: Signals | None = None,
-    ) -> None:
-        self.is_json = about is not None
+    def __init__(self, about: Mapping[str, object], signals: Signals | None = None) -> None:
+        self._is_json = answers.wanted()
         self._about = about
         self._bar: Bar | None = None
         self._signals = signals
@@ -103,7 +99,7 @@ class Report:
             return Ended("limit", f"{error}; --max-requests sets the limit")
         except ModbusError as error:
             if isinstance(error, ConnectFailed) and not found():
-                device_errors.fail(error, target, {"target": target} if self.is_json else None)
+                device_errors.fail(error, target)
             return Ended(**device_errors.problem(error))  # type: ignore[arg-type]
         except Interrupted:
             return INTERRUPTED
@@ -111,13 +107,13 @@ class Report:
 
     def text(self, *lines: str) -> None:
         """Prints lines, unless the output is JSON."""
-        if not self.is_json and lines:
+        if not self._is_json and lines:
             with self.held():
                 self._print("\n".join(lines))
 
     def entry(self, entry: Mapping[str, object]) -> None:
         """Prints an element of the list, if the output is JSON."""
-        if self.is_json:
+        if self._is_json:
             with self.held():
                 # The comma is at the beginning: each line is complete when it is written.
                 comma = "," if self._has_begun else " "
@@ -126,14 +122,14 @@ class Report:
 
     def end(self, rest: Mapping[str, object]) -> None:
         """Prints the rest of the object, if the output is JSON."""
-        if self.is_json:
+        if self._is_json:
             self._begin()
             self._print("  ],\n" + json.dumps(rest, indent=2).removeprefix("{\n"))
 
     def _begin(self) -> None:
         if not self._has_begun:
             self._has_begun = True
-            fields = [(key, json.dumps(value)) for key, value in (self._about or {}).items()]
+            fields = [(key, json.dumps(value)) for key, value in self._about.items()]
             about = "".join(f'  "{key}": {value},\n' for key, value in fields)
             self._print(f'{{\n{about}  "found": [')
 

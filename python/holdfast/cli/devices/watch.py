@@ -116,7 +116,7 @@ def watch(
         place, count = item.single(words, modicon=modicon)
         chosen = place, count or 1
     if url:
-        source = _device(checked_url(target), chosen, unit, timeout, as_json)
+        source = _device(checked_url(target), chosen, unit, timeout)
     else:
         source = _appliance(Path(target), memory, chosen, timeout)
     source.blocks, missing = sources.cut(source.blocks)
@@ -125,8 +125,7 @@ def watch(
         try:
             first = source.read()
         except (ModbusError, Unreadable, OSError) as error:
-            answer = {"target": source.url} if as_json else None
-            device_errors.fail(error, source.url, answer, where=source.where)
+            device_errors.fail(error, source.url, where=source.where)
         if not as_json and standard_output.is_screen():
             from holdfast.cli.live.registers_view import View
 
@@ -142,9 +141,7 @@ def watch(
         source.close()
 
 
-def _device(
-    url: str, chosen: tuple[Place, int] | None, unit: int, timeout: float, as_json: bool
-) -> Source:
+def _device(url: str, chosen: tuple[Place, int] | None, unit: int, timeout: float) -> Source:
     """The blocks of a device: the requested block, or all that exist."""
     client = device.connect(url, unit, timeout)
     where = f"{url}, unit {unit}"
@@ -168,11 +165,10 @@ def _device(
             ]
     except ModbusError as error:
         client.close()
-        device_errors.fail(error, url, {"target": url} if as_json else None)
+        device_errors.fail(error, url)
     if not blocks:
         client.close()
-        answer = {"target": url} if as_json else None
-        device_errors.fail("no address was found", url, answer)
+        device_errors.fail("no address was found", url)
     return sources.DeviceSource(where, url, client, blocks)
 
 
@@ -238,7 +234,7 @@ def _lines(
         try:
             values = source.read()
         except (ModbusError, Unreadable, OSError) as error:
-            sources.print_error(error, source.url, as_json=as_json)
+            sources.print_error(error, source.url)
             continue
         for change in tracker.update(time.monotonic(), values):
             _print_change(change, source.url, as_json)

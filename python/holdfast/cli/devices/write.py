@@ -181,7 +181,7 @@ def _carry_out(
             maybe = device_errors.maybe_written(error)
             # It is not known how much of a split write Ctrl-C has left.
             written = {"written": found.written} if isinstance(found, ModbusError) else {}
-            shown = {**fields, **written, "maybe_written": maybe} if as_json else None
+            shown = {**fields, **written, "maybe_written": maybe}
             first = f"{job.where} was possibly written" if maybe else None
             device_errors.fail(
                 error, url, shown, first, is_in_area=isinstance(job, _Job), is_write=True
@@ -192,8 +192,7 @@ def _carry_out(
             error = device_errors.of_write(found)
             if not as_json:
                 click.echo(f"{job.summary}; could not be read back", err=True)
-            certain = {**fields, "written": fields["count"], "maybe_written": False}
-            shown = certain if as_json else None
+            shown = {**fields, "written": fields["count"], "maybe_written": False}
             device_errors.fail(error, url, shown, is_in_area=isinstance(job, _Job))
     try:
         if as_json:

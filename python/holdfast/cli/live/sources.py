@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import click
 
-from holdfast.cli import terminal_text
+from holdfast.cli import answers, terminal_text
 from holdfast.cli.device_errors import hint, problem
 from holdfast.cli.options.device import read_raw
 from holdfast.cli.terminal_text import print_json
@@ -111,9 +111,9 @@ def cut(
     return kept, total - sum(block.count for block in kept)
 
 
-def print_error(error: object, url: str, *, as_json: bool) -> None:
+def print_error(error: object, url: str) -> None:
     """Prints why a later reading failed: watching goes on."""
-    if as_json:
+    if answers.wanted():
         now = {"time": terminal_text.timestamp()}
         print_json({"ok": False, "target": url, **now, **problem(error)})
     else:

@@ -96,7 +96,7 @@ def bench(
         ):
             asyncio.run(load.run(advance and (lambda load: advance(int(10 * load.elapsed)))))
     except ModbusError as error:
-        device_errors.fail(error, url, fields if as_json else None)
+        device_errors.fail(error, url, fields)
     answered = load.latencies.count > 0
     if as_json:
         wrong = {} if answered else device_errors.problem(load.error or "no reply")

@@ -33,8 +33,7 @@ def watch_tags(source: TagSource, form: Form, every: float, times: int | None) -
         moment, first = source.read()
         error = common_error(first)
         if error is not None:
-            answer = {"target": source.url} if form == "json" else None
-            fail(error, source.url, answer, where=source.where)
+            fail(error, source.url, where=source.where)
         if form == "text" and standard_output.is_screen():
             from holdfast.cli.tags.view import TagView
 
@@ -70,7 +69,7 @@ def _lines(
             click.echo(recording.row(moment, readings, is_shown=sys.stdout.isatty()), nl=False)
         elif tracker.error is not None:
             if before is None:
-                print_error(tracker.error, source.url, as_json=form == "json")
+                print_error(tracker.error, source.url)
         else:
             for change in changes:
                 _print_change(change, source, form)

@@ -43,7 +43,7 @@ def write_tags(
             writes = _prepared(of, texts, client)
         except ModbusError as error:
             fields = {"target": of.url, "unit": of.unit, "written": [], "maybe_written": False}
-            device_errors.fail(error, of.url, fields if as_json else None)
+            device_errors.fail(error, of.url, fields)
         for at, write in enumerate(writes):
             try:
                 write.send(client)
@@ -124,7 +124,7 @@ def _differing(
         fields = {"target": of.url, "unit": of.unit, "written": names, "maybe_written": False}
         if not as_json:
             click.echo("Could not be read back.", err=True)
-        device_errors.fail(error, of.url, fields if as_json else None)
+        device_errors.fail(error, of.url, fields)
     return {
         name: value_shown(write.tag, now)
         for name, (write, (is_alike, now)) in found.items()
