@@ -29,7 +29,6 @@ from holdfast.cli.options.option import (
     flag,
     json_option,
     option,
-    require_known,
 )
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.terminal_text import print_json
@@ -87,12 +86,10 @@ def replay(
     """
     if bind is not None and not bind.address.is_loopback:
         raise click.UsageError(f"--bind {bind}: a replay is only served to this machine.")
-    if follow and to is not None:
-        raise click.UsageError("--follow and --to can't be used together.")
-    if follow and output is not None:
-        raise click.UsageError("--follow and --output can't be used together.")
-    if follow and values:
-        raise click.UsageError("--follow and --values can't be used together.")
+    others = {"--to": to is not None, "--output": output is not None, "--values": values}
+    for other, is_given in others.items():
+        if follow and is_given:
+            raise click.UsageError(f"--follow and {other} can't be used together.")
     if memory is not None and output is None:
         raise click.UsageError("--memory is for --output.")
     config = load_or_exit(file)
@@ -105,7 +102,11 @@ def replay(
     ]
     if not memories:
         raise click.UsageError(f"no memory is replicated through the log {log}.")
-    chosen = None if output is None else _chosen(dict(memories), memory, output)
+    chosen = None
+    if output is not None:
+        memory_file.kind_of(output)
+        of_name = dict(memories)
+        chosen = of_name[memory_file.chosen(of_name, memory, "the log")]
     signals = Signals()
     with ExitStack() as running:
         try:
@@ -168,17 +169,6 @@ def replay(
         with _served(memories, bind, as_json=as_json):
             while not signals.received:
                 time.sleep(SIGNAL_INTERVAL_S)
-
-
-def _chosen(memories: dict[str, _core.Memory], name: str | None, output: Path) -> _core.Memory:
-    """The memory whose values are written."""
-    memory_file.kind_of(output)
-    if name is None and len(memories) > 1:
-        raise click.UsageError(f"the log has several memories, add --memory: {listing(memories)}")
-    if name is None:
-        return next(iter(memories.values()))
-    require_known(name, memories, "the log has no memory", "memories")
-    return memories[name]
 
 
 def _passes(error: _core.LogError) -> bool:

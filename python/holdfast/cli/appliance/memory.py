@@ -17,12 +17,10 @@ from holdfast.cli.options.option import (
     flag,
     json_option,
     option,
-    require_known,
 )
 from holdfast.cli.terminal_text import print_json
 from holdfast.config import ConfigError
 from holdfast.config.initial_values import parse, read
-from holdfast.runtime.text import listing
 
 if TYPE_CHECKING:
     from holdfast.cli.appliance.memory_file import KeptArea
@@ -67,7 +65,7 @@ def export(file: Path, name: str | None, output: Path | None, zeros: bool, set_a
     """Print the values of a memory in FILE, in the format of `initial`."""
     kind = ".csv" if output is None else memory_file.kind_of(output)
     found = _contents(file, set_aside=set_aside)
-    areas = {} if set_aside and not found else _chosen(found, name, file)
+    areas = {} if set_aside and not found else found[_chosen(found, name, file)]
     text = memory_file.written(areas, kind, zeros=zeros)
     if output is None:
         click.echo(text, nl=False)
@@ -87,7 +85,8 @@ def import_(file: Path, values: Path, name: str | None, merge: bool) -> None:
     """
     memory_file.kind_of(values)
     found = _contents(file)
-    areas = _chosen(found, name, file)
+    chosen = _chosen(found, name, file)
+    areas = found[chosen]
     try:
         spans: dict[str, range | None] = {area: kept.addresses for area, kept in areas.items()}
         text = read(values, str(values), spans)
@@ -96,7 +95,6 @@ def import_(file: Path, values: Path, name: str | None, merge: bool) -> None:
         runs, problems = (), list(error.problems)
     if problems:
         fail("\n".join(str(problem) for problem in problems), ExitCode.WRONG)
-    chosen = next(each for each, kept in found.items() if kept is areas)
     try:
         memory_file.replace(file, chosen, runs, merge=merge)
     except OSError as error:
@@ -118,13 +116,12 @@ def release(file: Path, name: str | None) -> None:
     if not found:
         click.echo(f"{file}: no values are set aside")
         return
-    areas = _chosen(found, name, file)
-    chosen = next(each for each, kept in found.items() if kept is areas)
+    chosen = _chosen(found, name, file)
     try:
         memory_file.release(file, chosen)
     except OSError as error:
         fail(error, ExitCode.WRONG)
-    _show(f"released of {chosen}", areas)
+    _show(f"released of {chosen}", found[chosen])
 
 
 def _contents(file: Path, *, set_aside: bool = False) -> dict[str, dict[Area, KeptArea]]:
@@ -149,14 +146,7 @@ def _show(name: str, areas: dict[Area, KeptArea]) -> None:
         click.echo(f"{name}: {area} {kept.start} to {kept.addresses.stop - 1}, {set_:,} not 0")
 
 
-def _chosen(
-    found: dict[str, dict[Area, KeptArea]], name: str | None, file: Path
-) -> dict[Area, KeptArea]:
+def _chosen(found: dict[str, dict[Area, KeptArea]], name: str | None, file: Path) -> str:
     if not found:
         raise click.UsageError(f"{file} has no memories")
-    if name is None and len(found) == 1:
-        return next(iter(found.values()))
-    if name is None:
-        raise click.UsageError(f"{file} has several memories, add --memory: {listing(found)}")
-    require_known(name, found, f"{file} has no memory", "memories")
-    return found[name]
+    return memory_file.chosen(found, name, file)

@@ -10,12 +10,13 @@ import click
 
 from holdfast import _core
 from holdfast.cli.exit_codes import ExitCode, fail
+from holdfast.cli.options.option import require_known
 from holdfast.config.initial_values import KINDS
 from holdfast.runtime.text import listing
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from holdfast.config.initial_values import InitialRun
@@ -53,6 +54,16 @@ def contents(file: Path, *, set_aside: bool = False) -> dict[str, dict[Area, Kep
     }
 
 
+def chosen(memories: Collection[str], name: str | None, owner: object) -> str:
+    """The memory of that name, or the only one. Raises `click.UsageError`."""
+    if name is None and len(memories) > 1:
+        raise click.UsageError(f"{owner} has several memories, add --memory: {listing(memories)}")
+    if name is None:
+        return next(iter(memories))
+    require_known(name, memories, f"{owner} has no memory", "memories")
+    return name
+
+
 def replace(file: Path, memory: str, runs: Iterable[InitialRun], *, merge: bool) -> None:
     """Stores values in a memory of the file. Without `merge`, all its other values become 0.
 
@@ -60,7 +71,8 @@ def replace(file: Path, memory: str, runs: Iterable[InitialRun], *, merge: bool)
     """
     areas = contents(file)[memory]
     sizes = {area: len(kept.values) for area, kept in areas.items()}
-    files = {int(area.removeprefix(FILE)): sizes.pop(area) for area in areas if _is_file(area)}
+    numbers = {area: area.removeprefix(FILE) for area in areas if area.startswith(FILE)}
+    files = {int(number): sizes.pop(area) for area, number in numbers.items()}
     spans: Any = {area: (areas[area].start, size) for area, size in sizes.items()}
     made = _core.Memory(**spans, files=files)
     opened = _core.MemoryFile(str(file), [(memory, made)], 1.0)
@@ -134,10 +146,6 @@ def _yaml_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]
             run.append(value)
         if run:
             yield f"  {first}: {run}"
-
-
-def _is_file(area: str) -> bool:
-    return area.startswith(FILE)
 
 
 def _values(area: Area, size: int, data: bytes) -> list[int]:
