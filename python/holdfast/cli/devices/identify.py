@@ -56,7 +56,11 @@ def identify(url: str, unit: int, timeout: float, as_json: bool) -> None:
         click.echo(f"holdfast: {url}: function 43/14: {identification}", err=True)
         click.echo(f"holdfast: {url}: function 17: {server_id}", err=True)
     else:
-        click.echo("\n".join([*_identified(identification), "", *_served(server_id)]))
+        sections = (
+            section("Device identification (function 43/14)", identification, _identified),
+            section("Server id (function 17)", server_id, _served),
+        )
+        click.echo("\n\n".join(sections))
     if not said:
         sys.exit(ExitCode.FAILED)
 
@@ -78,6 +82,18 @@ def answer_to_json(
     return {"ok": True, **made(answer)}
 
 
+def section(
+    head: str, answer: Answer | ModbusError, made: Callable[[Answer], list[tuple[str, str]]]
+) -> str:
+    """A heading, and an answer as indented lines of names and texts, or its error."""
+    bold = terminal_text.styled(head, bold=True)
+    if isinstance(answer, ModbusError):
+        return f"{bold}\n  {terminal_text.styled(str(answer), fg='red')}"
+    rows = made(answer)
+    width = max(len(name) for name, _ in rows)
+    return "\n".join([bold, *(f"  {name:{width}}  {text}".rstrip() for name, text in rows)])
+
+
 def _identification(answer: Identification) -> dict[str, object]:
     names = {name: getattr(answer, name) for name in OBJECT_NAMES}
     objects = {str(number): data.hex() for number, data in sorted(answer.objects.items())}
@@ -93,26 +109,17 @@ def _server_id(answer: ServerId) -> dict[str, object]:
     }
 
 
-def _identified(answer: Identification | ModbusError) -> list[str]:
-    """The identification as text."""
-    head = terminal_text.styled("Device identification (function 43/14)", bold=True)
-    if isinstance(answer, ModbusError):
-        return [head, f"  {terminal_text.styled(str(answer), fg='red')}"]
+def _identified(answer: Identification) -> list[tuple[str, str]]:
     level = LEVELS.get(answer.conformity_level & 0x7F)
     rows = [
         (_name(number), _text(data) if number < 0x80 or _is_text(data) else data.hex(" "))
         for number, data in sorted(answer.objects.items())
     ]
     code = f"0x{answer.conformity_level:02X}"
-    rows.append(("conformity level", f"{code}, {level}" if level else code))
-    return [head, *listed(rows)]
+    return [*rows, ("conformity level", f"{code}, {level}" if level else code)]
 
 
-def _served(answer: ServerId | ModbusError) -> list[str]:
-    """The server id as text."""
-    head = terminal_text.styled("Server id (function 17)", bold=True)
-    if isinstance(answer, ModbusError):
-        return [head, f"  {terminal_text.styled(str(answer), fg='red')}"]
+def _served(answer: ServerId) -> list[tuple[str, str]]:
     rows = [("bytes", answer.data.hex(" "))]
     if answer.server_id is not None:
         rows.insert(0, ("server id", str(answer.server_id)))
@@ -120,13 +127,7 @@ def _served(answer: ServerId | ModbusError) -> list[str]:
         rows.insert(1, ("running", "yes" if answer.running else "no"))
         if answer.additional and _is_text(answer.additional):
             rows.insert(2, ("text", _text(answer.additional)))
-    return [head, *listed(rows)]
-
-
-def listed(rows: list[tuple[str, str]]) -> list[str]:
-    """Indented lines of names and texts."""
-    width = max(len(name) for name, _ in rows)
-    return [f"  {name:{width}}  {text}".rstrip() for name, text in rows]
+    return rows
 
 
 def _name(number: int) -> str:

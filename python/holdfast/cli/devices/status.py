@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli import device_errors, terminal_text
-from holdfast.cli.devices.identify import answer_of, answer_to_json, listed
+from holdfast.cli import device_errors
+from holdfast.cli.devices.identify import answer_of, answer_to_json, section
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options import device
 from holdfast.cli.options.option import json_option
@@ -17,11 +17,7 @@ from holdfast.cli.terminal_text import print_json
 from holdfast.errors import ModbusError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from holdfast.client.requests import EventLog
-
-Answer = TypeVar("Answer")
 
 
 @click.command(epilog="Example: holdfast describe status tcp://192.168.0.10 --unit 3")
@@ -48,11 +44,7 @@ def status(url: str, unit: int, timeout: float, as_json: bool) -> None:
             "ok": ok,
             "target": url,
             "unit": unit,
-            **(
-                device_errors.problem(outputs)
-                if not ok and isinstance(outputs, ModbusError)
-                else {}
-            ),
+            **(device_errors.problem(outputs) if not ok else {}),
             "exception_status": answer_to_json(outputs, lambda found: {"outputs": found}),
             "event_counter": answer_to_json(
                 counter, lambda found: {"busy": found[0], "events": found[1]}
@@ -62,27 +54,16 @@ def status(url: str, unit: int, timeout: float, as_json: bool) -> None:
         print_json(said, indent=2)
     elif ok:
         sections = (
-            _section("Exception status (function 7)", outputs, _outputs),
-            _section("Event counter (function 11)", counter, _counter),
-            _section("Event log (function 12)", log, _log),
+            section("Exception status (function 7)", outputs, _outputs),
+            section("Event counter (function 11)", counter, _counter),
+            section("Event log (function 12)", log, _log),
         )
-        click.echo("\n\n".join("\n".join(lines) for lines in sections))
+        click.echo("\n\n".join(sections))
     else:
         for function, answer in zip((7, 11, 12), answers, strict=True):
             click.echo(f"holdfast: {url}: function {function}: {answer}", err=True)
     if not ok:
         sys.exit(ExitCode.FAILED)
-
-
-def _section(
-    head: str,
-    answer: Answer | ModbusError,
-    rows: Callable[[Answer], list[tuple[str, str]]],
-) -> list[str]:
-    bold = terminal_text.styled(head, bold=True)
-    if isinstance(answer, ModbusError):
-        return [bold, f"  {terminal_text.styled(str(answer), fg='red')}"]
-    return [bold, *listed(rows(answer))]
 
 
 def _outputs(found: int) -> list[tuple[str, str]]:
