@@ -118,15 +118,9 @@ def load_or_exit(path: Path | str, *, shows_warnings: bool = True) -> Config:
         config = load_whole(path)
     except ConfigError as error:
         show_problems(error)
-        sys.exit(exit_code(error))
+        # Service managers start nothing again after `WRONG`, but a mount may answer later.
+        is_answered = not isinstance(error, ConfigNotAnswered)
+        sys.exit(ExitCode.WRONG if is_answered else ExitCode.FAILED)
     for warning in config.warnings if shows_warnings else ():
         click.echo(f"warning: {warning}", err=True)
     return config
-
-
-def exit_code(error: ConfigError) -> ExitCode:
-    """The exit code for a configuration that could not be loaded.
-
-    Service managers start nothing again after `WRONG`, but a mount may answer later.
-    """
-    return ExitCode.FAILED if isinstance(error, ConfigNotAnswered) else ExitCode.WRONG

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,10 +9,10 @@ import click
 
 from holdfast.cli import CommandWithSubcommands, complete_subcommand
 from holdfast.cli.appliance.peer_rights import Peer, as_data, as_text
-from holdfast.cli.configuration import exit_code, load_or_exit, load_whole
+from holdfast.cli.configuration import load_or_exit
 from holdfast.cli.options.option import json_option, option, schema_option
-from holdfast.cli.terminal_text import print_json, print_problems, problems_to_json
-from holdfast.config import ConfigError, json_schema
+from holdfast.cli.terminal_text import print_json, problems_to_json
+from holdfast.config import json_schema
 from holdfast.net.addresses import parse_address
 
 if TYPE_CHECKING:
@@ -65,16 +64,11 @@ def check(file: Path, as_json: bool, address: Address | None, role: str | None) 
     if role is not None and address is None:
         raise click.UsageError("--role requires --as.")
     peer = None if address is None else Peer(address, role or "")
+    config = load_or_exit(file, shows_warnings=not as_json)
     if not as_json:
-        config = load_or_exit(file)
         text = config.dump() if peer is None else f"{as_text(config, peer)}\n"
         click.echo(text, nl=False)
         return
-    try:
-        config = load_whole(file)
-    except ConfigError as error:
-        print_problems(error)
-        sys.exit(exit_code(error))
     answer: dict[str, object] = {
         "ok": True,
         "target": str(file),
