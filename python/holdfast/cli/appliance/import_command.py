@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -43,13 +44,43 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 
-_common = option_group(
+@dataclass(frozen=True)
+class _Task:
+    """What all imports have: the file to convert, and where the result goes."""
+
+    file: Path
+    output: Path | None
+    force: bool
+    as_json: bool
+
+    def convert(self, read: Callable[[Path], Imported]) -> None:
+        """Converts the file, and writes or prints the result."""
+        if self.output is not None and _same(self.file, self.output):
+            raise click.UsageError("OUT and FILE are the same file.")
+        try:
+            imported = read(self.file)
+        except ConfigError as error:
+            _refuse(error, self.as_json)
+        if self.output is not None:
+            _write(self.output, imported.to_yaml(), self.force)
+        if self.as_json:
+            print_json(_answer(imported), indent=2)
+            return
+        if self.output is None:
+            click.echo(imported.to_yaml(), nl=False)
+        for note in imported.notes:
+            click.echo(str(note), err=True)
+        click.echo(_summary(imported, self.output), err=True)
+
+
+_task = option_group(
     config_argument,
     option("--output", "OUT", "Write the YAML to this file.", click.Path(path_type=Path)),
     flag("--force", "Replace OUT if it exists."),
     json_option,
+    into=("task", _Task),
 )
-"""Adds the argument and the options of all imports."""
+"""Adds the argument and the options of all imports: the argument `task`."""
 
 
 @click.group(
@@ -62,7 +93,7 @@ def import_() -> None:
 
 
 @import_.command(epilog="Example: holdfast import mma config.yaml --output plant.yaml")
-@_common
+@_task
 @flag(
     "--as-it-was-meant/--as-it-ran as_meant",
     "Convert keys that the source ignored as documented, or as they ran. Default: as it ran.",
@@ -76,10 +107,7 @@ def import_() -> None:
 )
 @option("--grant-mqtt", "AREA,...", "The same for MQTT.", areas_of)
 def mma(
-    file: Path,
-    output: Path | None,
-    force: bool,
-    as_json: bool,
+    task: _Task,
     as_meant: bool,
     keep_published_tokens: bool,
     grant_rest: tuple[Area, ...] | None,
@@ -91,21 +119,21 @@ def mma(
     what was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write
     OUT, 2 can't import FILE.
     """
-    read = partial(
-        read_mma,
-        file,
-        as_meant=as_meant,
-        keep_published_tokens=keep_published_tokens,
-        grant_rest=grant_rest or (),
-        grant_mqtt=grant_mqtt or (),
+    task.convert(
+        partial(
+            read_mma,
+            as_meant=as_meant,
+            keep_published_tokens=keep_published_tokens,
+            grant_rest=grant_rest or (),
+            grant_mqtt=grant_mqtt or (),
+        )
     )
-    _convert(read, file, output, force, as_json)
 
 
 @import_.command(
     epilog="Example: holdfast import modpoll boiler.csv --url tcp://10.0.0.5 --output plant.yaml"
 )
-@_common
+@_task
 @option(
     "--url",
     "URL",
@@ -119,36 +147,34 @@ def mma(
     f"{INTERVAL_S:g}",
     Duration(MIN_INTERVAL_S, MAX_INTERVAL_S),
 )
-def modpoll(
-    file: Path, output: Path | None, force: bool, as_json: bool, url: str, interval: float
-) -> None:
+def modpoll(task: _Task, url: str, interval: float) -> None:
     """Convert FILE, a CSV file of the Python program modpoll, to a Holdfast configuration.
 
     Prints the new configuration. Notes on standard error, and comments in the configuration, say
     what was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write
     OUT, 2 can't import FILE.
     """
-    _convert(lambda: read_modpoll(file, url, interval), file, output, force, as_json)
+    task.convert(lambda file: read_modpoll(file, url, interval))
 
 
 @import_.command(epilog="Example: holdfast import replicator replicator.yaml --output mirror.yaml")
-@_common
-def replicator(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
+@_task
+def replicator(task: _Task) -> None:
     """Convert FILE, a configuration of the Modbus Replicator, to a Holdfast configuration.
 
     Prints the new configuration. Notes on standard error, and comments in the configuration, say
     what was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write
     OUT, 2 can't import FILE.
     """
-    _convert(lambda: read_replicator(file), file, output, force, as_json)
+    task.convert(read_replicator)
 
 
 @import_.command(
     "home-assistant",
     epilog="Example: holdfast import home-assistant configuration.yaml --output plant.yaml",
 )
-@_common
-def home_assistant(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
+@_task
+def home_assistant(task: _Task) -> None:
     """Convert the modbus section of FILE, of Home Assistant, to a Holdfast configuration.
 
     FILE can also contain only that section. Prints the new configuration: its devices appear in
@@ -156,40 +182,19 @@ def home_assistant(file: Path, output: Path | None, force: bool, as_json: bool) 
     was not converted, what was changed and what to check. Exit codes: 0 done, 1 can't write OUT,
     2 can't import FILE.
     """
-    _convert(lambda: read_home_assistant(file), file, output, force, as_json)
+    task.convert(read_home_assistant)
 
 
 @import_.command(epilog="Example: holdfast import telegraf telegraf.conf --output plant.yaml")
-@_common
-def telegraf(file: Path, output: Path | None, force: bool, as_json: bool) -> None:
+@_task
+def telegraf(task: _Task) -> None:
     """Convert the Modbus inputs of FILE, of Telegraf, to a Holdfast configuration.
 
     Prints the new configuration, with its first outputs.influxdb_v2. Notes on standard error, and
     comments in the configuration, say what was not converted, what was changed and what to check.
     Exit codes: 0 done, 1 can't write OUT, 2 can't import FILE.
     """
-    _convert(lambda: read_telegraf(file), file, output, force, as_json)
-
-
-def _convert(
-    read: Callable[[], Imported], file: Path, output: Path | None, force: bool, as_json: bool
-) -> None:
-    if output is not None and _same(file, output):
-        raise click.UsageError("OUT and FILE are the same file.")
-    try:
-        imported = read()
-    except ConfigError as error:
-        _refuse(error, as_json)
-    if output is not None:
-        _write(output, imported.to_yaml(), force)
-    if as_json:
-        print_json(_answer(imported), indent=2)
-        return
-    if output is None:
-        click.echo(imported.to_yaml(), nl=False)
-    for note in imported.notes:
-        click.echo(str(note), err=True)
-    click.echo(_summary(imported, output), err=True)
+    task.convert(read_telegraf)
 
 
 def _refuse(error: ConfigError, as_json: bool) -> None:
