@@ -115,7 +115,7 @@ _AUTHORITY = option_group(
     file_option("--ca ca_file", _CA, EXISTING_FILE),
     file_option("--ca-key ca_key_file", _CA_KEY, EXISTING_FILE),
     file_option("--ca-passphrase-file", _SECRET, EXISTING_FILE),
-    into=("files", lambda **given: AuthorityFiles(**given)),
+    into=("files", AuthorityFiles),
 )
 
 
@@ -129,7 +129,7 @@ def _new_key(days: int) -> Callable[[Command], Command]:
         choice("--key-type", "Kind of the key.", making.KEY_KINDS, "p256"),
         flag("--passphrase asked", "Encrypt the key; prompts for a passphrase."),
         file_option("--passphrase-file", "Encrypt it with the passphrase here.", EXISTING_FILE),
-        into=("new", lambda **given: NewKey(**given)),
+        into=("new", NewKey),
     )
 
 

@@ -50,7 +50,7 @@ survey_options = option_group(
     option("--range span", "FIRST-LAST", "Addresses to search.", _span, f"0-{LAST_ADDRESS}"),
     number_option("--max-requests", _LIMIT),
     delay_option,
-    into=("settings", lambda **given: Settings(**given)),
+    into=("settings", Settings),
 )
 
 

@@ -30,37 +30,6 @@ if TYPE_CHECKING:
     from holdfast.cli.tags.selection import TaggedDevice
 Form: TypeAlias = Literal["text", "csv", "json"]
 
-tag_file_options = option_group(
-    file_option("--tags", "The tags of this list (YAML or CSV)."),
-    option("--profile", "NAME", "With --tags: the profile of a configuration FILE."),
-    option(
-        "--config",
-        "FILE",
-        "URL is the name of a device in this configuration: its URL, unit id and tags.",
-        FILE,
-        is_eager=True,
-    ),
-    into=("files", lambda **given: TagFiles(**given)),
-)
-"""Adds `--tags`, `--profile` and `--config`: the argument `files`."""
-
-selection_options = option_group(
-    option("--only", "NAME", "Only these tags; * stands for any text. Repeatable.", multiple=True),
-    number_option("--max-gap", "Read gaps of up to N between tags with them.", 0, LAST_ADDRESS, 0),
-    flag("--csv", "Print CSV: the time, and a column for each tag."),
-    file_option("--record", "Append every reading to this CSV file."),
-    into=("selection", lambda **given: Selection(**given)),
-)
-"""Adds `--only`, `--max-gap`, `--csv` and `--record`: the argument `selection`."""
-
-
-def _url(ctx: click.Context, _param: click.Parameter, value: str) -> str:
-    """Checks a URL, unless it is the name of a device."""
-    return value if ctx.params.get("config") else checked_url(value)
-
-
-url_argument = click.argument("url", callback=_url, metavar="URL")
-
 
 @dataclass(frozen=True)
 class TagFiles:
@@ -104,6 +73,38 @@ class Selection:
             if value:
                 name = name.replace("_", "-")
                 raise click.UsageError(f"--{name} requires AREA:ADDRESS or --tags.")
+
+
+tag_file_options = option_group(
+    file_option("--tags", "The tags of this list (YAML or CSV)."),
+    option("--profile", "NAME", "With --tags: the profile of a configuration FILE."),
+    option(
+        "--config",
+        "FILE",
+        "URL is the name of a device in this configuration: its URL, unit id and tags.",
+        FILE,
+        is_eager=True,
+    ),
+    into=("files", TagFiles),
+)
+"""Adds `--tags`, `--profile` and `--config`: the argument `files`."""
+
+selection_options = option_group(
+    option("--only", "NAME", "Only these tags; * stands for any text. Repeatable.", multiple=True),
+    number_option("--max-gap", "Read gaps of up to N between tags with them.", 0, LAST_ADDRESS, 0),
+    flag("--csv", "Print CSV: the time, and a column for each tag."),
+    file_option("--record", "Append every reading to this CSV file."),
+    into=("selection", Selection),
+)
+"""Adds `--only`, `--max-gap`, `--csv` and `--record`: the argument `selection`."""
+
+
+def _url(ctx: click.Context, _param: click.Parameter, value: str) -> str:
+    """Checks a URL, unless it is the name of a device."""
+    return value if ctx.params.get("config") else checked_url(value)
+
+
+url_argument = click.argument("url", callback=_url, metavar="URL")
 
 
 def device_of(
