@@ -460,7 +460,7 @@ def test_the_greeting_says_names_and_compatibility() -> None:
     settings = Settings(
         (parse_allowed("10.0.0.0/8"),), hosts=frozenset({NAME, "gw"}), compat="port-of-call"
     )
-    lines = _greeting_text("http://127.0.0.1:8090", settings).splitlines()
+    lines = _greeting_text("http", "127.0.0.1", 8090, settings).splitlines()
     assert lines[3:6] == [
         "  clients: 127.0.0.0/8, ::1/128; no tokens",
         f"  names: {NAME}, gw",

@@ -863,19 +863,20 @@ def test_a_signal_ends_it_with_exit_code_0(server: holdfast.Server, number: int)
 )
 def test_the_greeting_has_an_example_that_may_be(allow: str, example: str) -> None:
     settings = Settings((parse_allowed(allow),))
-    assert f"-d '{example}'" in _greeting_text("http://127.0.0.1:8090", settings)
+    assert f"-d '{example}'" in _greeting_text("http", "127.0.0.1", 8090, settings)
 
 
 @pytest.mark.parametrize(
-    ("served", "url"),
+    ("scheme", "host", "url"),
     [
-        ("http://0.0.0.0:8090", "http://127.0.0.1:8090"),
-        ("https://[::]:8090", "https://[::1]:8090"),
-        ("http://10.0.0.9:8090", "http://10.0.0.9:8090"),
+        ("http", "0.0.0.0", "http://127.0.0.1:8090"),
+        ("https", "::", "https://[::1]:8090"),
+        ("http", "10.0.0.9", "http://10.0.0.9:8090"),
     ],
 )
-def test_the_greeting_names_an_address_that_can_be_opened(served: str, url: str) -> None:
-    lines = _greeting_text(served, Settings((parse_allowed("10.0.0.0/8"),))).splitlines()
+def test_the_greeting_names_an_address_that_can_be_opened(scheme: str, host: str, url: str) -> None:
+    settings = Settings((parse_allowed("10.0.0.0/8"),))
+    lines = _greeting_text(scheme, host, 8090, settings).splitlines()
     assert lines[0] == f"Console: {url}/, API documentation: {url}/docs"
 
 

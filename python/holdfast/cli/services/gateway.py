@@ -22,7 +22,7 @@ from holdfast.config.models.services import Compat
 from holdfast.config.values.allow_entries import parse_allowed
 from holdfast.config.values.host_names import parse_host_name
 from holdfast.gateway import token_file
-from holdfast.net.addresses import LOOPBACK, joined, reachable, unbracketed
+from holdfast.net.addresses import LOOPBACK, joined, reachable
 from holdfast.protocol import PORT
 from holdfast.types import Access
 
@@ -148,14 +148,12 @@ def _greeting(appliance: Appliance) -> str:
     settings = appliance.config.gateway
     assert settings is not None
     assert listening.port is not None
-    served = f"{listening.type}://{joined(listening.host, listening.port)}"
-    return _greeting_text(served, gateway_settings(settings))
+    place = listening.type, listening.host, listening.port
+    return _greeting_text(*place, gateway_settings(settings))
 
 
-def _greeting_text(served: str, settings: Settings) -> str:
-    scheme, _, address = served.partition("://")
-    at, _, port = address.rpartition(":")
-    url = f"{scheme}://{joined(reachable(unbracketed(at)), int(port))}"
+def _greeting_text(scheme: str, host: str, port: int, settings: Settings) -> str:
+    url = f"{scheme}://{joined(reachable(host), port)}"
     can = "reads and writes" if settings.writes else "reads"
     who = ", ".join(name for name, _ in settings.tokens) or "no tokens"
     example, its_port = _example(settings.allow[0])
