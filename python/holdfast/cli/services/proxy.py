@@ -107,16 +107,22 @@ def proxy(
     Exit codes: 0 stopped by a signal, 1 can't listen, 2 wrong usage.
     """
     target = parse(url)
+    is_line = isinstance(target, SerialTarget)
     with usable():
         endpoint(target)
-    _check(target, bind, sources, functions, unit, access)
+    require_source(bind, sources)
+    if is_line and unit is not None and not 1 <= unit <= MAX_SERIAL_UNIT:
+        raise click.UsageError(f"--unit on a serial line is 1 to {MAX_SERIAL_UNIT}, not {unit}.")
+    for code in functions or () if access == "read-only" else ():
+        if code in WRITING_CODES or code not in CODES:
+            raise click.UsageError(f"--functions {code} may write: omit it, or --access read-only.")
     one = isinstance(target, SerialTarget) or target.transport not in IN_FLIGHT
     if one and in_flight not in (1, "auto"):
         raise click.UsageError(f"--in-flight {in_flight} requires {' or '.join(IN_FLIGHT)}.")
     rule: dict[str, Any] = {
         "sources": list(sources or LOOPBACK),
         "access": access,
-        "units": _units(target, unit),
+        "units": _units(MAX_SERIAL_UNIT if is_line else MAX_UNIT, unit),
     }
     if functions is not None:
         rule["functions"] = functions
@@ -138,27 +144,10 @@ def proxy(
     )
 
 
-def _check(
-    target: Target,
-    bind: Bind,
-    sources: tuple[Network, ...],
-    functions: list[int] | None,
-    unit: int | None,
-    access: Access,
-) -> None:
-    """Raises `click.UsageError` for options that do not fit together."""
-    require_source(bind, sources)
-    if isinstance(target, SerialTarget) and unit is not None and not 1 <= unit <= MAX_SERIAL_UNIT:
-        raise click.UsageError(f"--unit on a serial line is 1 to {MAX_SERIAL_UNIT}, not {unit}.")
-    for code in functions or () if access == "read-only" else ():
-        if code in WRITING_CODES or code not in CODES:
-            raise click.UsageError(f"--functions {code} may write: omit it, or --access read-only.")
-
-
-def _units(target: Target, unit: int | None) -> dict[int | str, dict[str, str]]:
+def _units(last: int, unit: int | None) -> dict[int | str, dict[str, str]]:
+    """All unit ids lead to the device, or those up to the last one to the link."""
     if unit is not None:
         return {key: {"route": DEVICE} for key in range(MAX_UNIT + 1)}
-    last = MAX_SERIAL_UNIT if isinstance(target, SerialTarget) else MAX_UNIT
     return {f"0-{last}": {"route": LINK}}
 
 
