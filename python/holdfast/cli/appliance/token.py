@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import json
 import re
 import secrets
 import sys
@@ -14,8 +13,7 @@ import click
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import flag, json_option, option
 from holdfast.cli.terminal_text import print_json
-from holdfast.config.dump import PLAIN
-from holdfast.config.text.yaml_document import scalar
+from holdfast.config.dump import on_one_line
 from holdfast.config.values.scalars import NAME_FORM, is_name
 
 SECRET_BYTES = 32
@@ -65,7 +63,7 @@ def token(name: str, stdin: bool, gateway: bool, line: bool, as_json: bool) -> N
     if not stdin:
         click.echo(f"The secret, shown only once: {secret}\n")
     click.echo(f"Add under {'gateway' if gateway else 'rest'}.tokens in the configuration:\n")
-    entry = _ENTRY.format(name=_quoted(name), digest=digest)
+    entry = _ENTRY.format(name=on_one_line(name), digest=digest)
     click.echo(entry if gateway else entry + _RIGHTS, nl=False)
 
 
@@ -96,8 +94,3 @@ def _decoded(data: bytes) -> str:
 
 def _warn(message: str) -> None:
     click.echo(f"warning: {message}", err=True)
-
-
-def _quoted(name: str) -> str:
-    """The name, quoted if YAML would not read it as the same text."""
-    return name if PLAIN.fullmatch(name) and scalar(name) == name else json.dumps(name)
