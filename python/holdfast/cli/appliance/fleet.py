@@ -20,14 +20,7 @@ from holdfast.net.nats.connection import Servers
 from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
 
 _HEAD = (
-    "node",
-    "state",
-    "partitions",
-    "devices",
-    "tags",
-    "refused",
-    "scans/s",
-    "missed",
+    *("node", "state", "partitions", "devices", "tags", "refused", "scans/s", "missed"),
     "version",
 )
 _SAMPLE_INTERVAL_S = 1.0
@@ -84,20 +77,8 @@ async def _status(name: str, servers: Servers, as_json: bool, watch: bool) -> bo
 def _lines(shown: dict[str, Any]) -> list[str]:
     if not shown["nodes"]:
         return [f"fleet {shown['fleet']}: no live node"]
-    rows = [
-        (
-            node["node"],
-            node["state"],
-            str(node["partitions"]),
-            str(node["devices"]),
-            str(node["tags"]),
-            str(node["refused"]),
-            f"{node['scans_per_second']:.1f}",
-            str(node["missed"]),
-            node["version"],
-        )
-        for node in shown["nodes"]
-    ]
+    nodes = [{**node, "scans/s": f"{node['scans_per_second']:.1f}"} for node in shown["nodes"]]
+    rows = [[str(node[name]) for name in _HEAD] for node in nodes]
     free = shown["free_partitions"]
     lines = [
         f"fleet {shown['fleet']}: {counted(len(rows), 'node')}, {shown['partitions']} partitions"
