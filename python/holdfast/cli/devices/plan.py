@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -140,25 +141,17 @@ def _reads(words: Sequence[str], modicon: bool) -> list[Field]:
     return reads
 
 
+@dataclass(frozen=True)
 class _Shown:
     """A plan and its device."""
 
-    def __init__(
-        self,
-        plan: Plan,
-        rules: Rules,
-        url: str,
-        name: str | None = None,
-        of: DeviceConfig | None = None,
-        tags: Sequence[Sequence[str]] = (),
-    ) -> None:
-        self.plan = plan
-        self.rules = rules
-        self.url = url
-        self.name = name
-        self.of = of
-        self.tags = [*[()] * (len(plan.reads) - len(tags)), *tags]
-        """For each read the names of its tags, none for those in `reads`, which are first."""
+    plan: Plan
+    rules: Rules
+    url: str
+    tags: Sequence[Sequence[str]]
+    """For each read the names of its tags."""
+    name: str | None = None
+    of: DeviceConfig | None = None
 
     @property
     def title(self) -> str:
@@ -178,7 +171,7 @@ def _of_url(
     if not reads:
         raise click.UsageError("URL requires at least one ITEM, as in hr:100 20.")
     rules: Rules = {**given}  # type: ignore[typeddict-item]
-    return _Shown(read_plans.plan(reads, rules), rules, url)
+    return _Shown(read_plans.plan(reads, rules), rules, url, [()] * len(reads))
 
 
 def _of_file(
@@ -201,7 +194,8 @@ def _of_file(
         asked = [(read.area, read.address, read.count) for read in settings.reads]
         fields = Reader(name, config.tags(name)).fields
         planned = read_plans.plan([*asked, *fields], rules)
-        yield _Shown(planned, rules, settings.url, name, settings, list(fields.values()))
+        tags = [*[()] * len(asked), *fields.values()]
+        yield _Shown(planned, rules, settings.url, tags, name, settings)
 
 
 def _compared(preset: Preset | None, fill: int | None, shown: _Shown) -> dict[str, Any] | None:
