@@ -180,31 +180,28 @@ class _Device:
                 message = f"found {show(into.area)}, allowed for {read.area}: {either(same_kind)}"
                 self.report.add((*path, "area"), message)
                 return
-        there = area_of(self.scope, path, into.memory, into.area)
-        if there is None:
-            return
+        noun = "bits" if into.area in BIT_AREAS else "registers"
+        found = f"found {read.count} {noun} from {into.address}"
         addresses = range(into.address, into.address + read.count)
-        if addresses[0] not in there or addresses[-1] not in there:
-            noun = "bits" if into.area in BIT_AREAS else "registers"
-            found = f"found {read.count} {noun} from {into.address}"
-            allowed = f"allowed in {into.area} of {into.memory}: {extent(there)}"
-            self.report.add((*path, "address"), f"{found}, {allowed}")
-            return
-        self.claims.append(Claim(path, into.memory, into.area, addresses))
+        self._claim((*path, "address"), Claim(path, into.memory, into.area, addresses), found)
 
     def _status(self, path: KeyPath, status: StatusConfig) -> None:
         with until_invalid():
             check_memory(self.scope, (*path, "memory"), status.memory)
-        there = area_of(self.scope, path, status.memory, status.area)
+        found = f"found {status.slot}, which covers addresses {extent(status.addresses)}"
+        claim = Claim(path, status.memory, status.area, status.addresses)
+        self._claim((*path, "slot"), claim, found)
+
+    def _claim(self, path: KeyPath, claim: Claim, found: str) -> None:
+        """Notes addresses, or reports at `path` that the area of the memory does not have them."""
+        there = area_of(self.scope, claim.path, claim.memory, claim.area)
         if there is None:
             return
-        block = status.addresses
-        if block[0] not in there or block[-1] not in there:
-            found = f"found {status.slot}, which covers addresses {extent(block)}"
-            allowed = f"allowed in {status.area} of {status.memory}: {extent(there)}"
-            self.report.add((*path, "slot"), f"{found}, {allowed}")
-            return
-        self.claims.append(Claim(path, status.memory, status.area, block))
+        if claim.addresses[0] in there and claim.addresses[-1] in there:
+            self.claims.append(claim)
+        else:
+            allowed = f"allowed in {claim.area} of {claim.memory}: {extent(there)}"
+            self.report.add(path, f"{found}, {allowed}")
 
 
 def _memory_of(forward: ForwardConfig, named: ForwardConfig | ForwardedStatusConfig) -> str | None:
