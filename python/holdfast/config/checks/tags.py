@@ -53,18 +53,11 @@ def _check_device(
         own = _tags(scope, path, device.tags, order)
         tags = _resolved(scope, path, device.tags, own, tags)
     for tag in tags.values():
-        if tag.source is None and (flaw := _forbidden(tag, device)):
+        for key, flaw in _flaws(tag, device):
             if tag.name in device.tags:
-                scope.report.add((*path, "tags", tag.name, "address"), flaw)
+                scope.report.add((*path, "tags", tag.name, key), flaw)
             else:
                 scope.report.add((*path, "profile"), f"{tag.name}: {flaw}")
-        for flaw in _flaws(tag, device):
-            assert isinstance(tag.scale, RegisterScale), "others have no flaws"
-            message = f"the scale is from {tag.scale.where}, {flaw}"
-            if tag.name in device.tags:
-                scope.report.add((*path, "tags", tag.name, "scale"), message)
-            else:
-                scope.report.add((*path, "profile"), f"{tag.name}: {message}")
 
 
 def _tags(scope: Scope, path: KeyPath, tags: Mapping[str, TagConfig], order: str) -> dict[str, Tag]:
@@ -110,38 +103,36 @@ def _resolved(
     return found
 
 
-def _forbidden(tag: Tag, device: DeviceConfig) -> str:
-    """Why no request to the device can read a value, or "" if one can."""
-    for overlapped in _overlapped(tag, device):
-        place = tag.address if len(tag.span) == 1 else extent(tag.span)
-        return f"found {place}, which overlaps {overlapped}, allowed: other addresses"
-    return ""
-
-
-def _flaws(tag: Tag, device: DeviceConfig) -> Iterator[str]:
-    """Why no request to the device can read a value together with its scale."""
-    source = tag.source
+def _flaws(tag: Tag, device: DeviceConfig) -> Iterator[tuple[str, str]]:
+    """Why no request to the device can read a value, or not with its scale; and the tag's key."""
+    span, source = tag.span, tag.source
     if source is None:
+        if (overlapped := next(_overlapped(tag, device), None)) is not None:
+            place = str(tag.address) if len(span) == 1 else extent(span)
+            message = f"found {place}, which overlaps {overlapped}, allowed: other addresses"
+            yield "address", message
         return
-    span, both = tag.span, "and a value is only read together with its scale"
-    place = f"{span.start} to {span.stop - 1}"
+    assert isinstance(tag.scale, RegisterScale), "others have no source"
+    where, both = tag.scale.where, "and a value is only read together with its scale"
+    found = f"the scale is from {where}, {extent(span)}"
     if len(span) > device.max_registers:
         most = device.max_registers
-        yield f"{place} are {len(span)} registers, max_registers is {most}, {both}"
+        yield "scale", f"{found} are {len(span)} registers, max_registers is {most}, {both}"
     for overlapped in _overlapped(tag, device):
-        yield f"{place} overlaps {overlapped}, {both}"
+        yield "scale", f"{found} overlaps {overlapped}, {both}"
     first, last = sorted((tag, source), key=lambda each: each.address)
     allowed = list(_stretches(device.readable, tag.area))
     inside = any(start <= first.end and last.address <= stop for start, stop in allowed)
     if allowed and first.end < last.address and not inside:
-        yield f"{first.end} to {last.address - 1} are not readable, {both}"
+        between = extent(range(first.end, last.address))
+        yield "scale", f"the scale is from {where}, {between} are not readable, {both}"
 
 
 def _overlapped(tag: Tag, device: DeviceConfig) -> Iterator[str]:
     """The forbidden ranges that a read of the tag would touch."""
     for start, stop in _stretches(device.forbidden, tag.area):
         if start < tag.span.stop and tag.span.start < stop:
-            yield f"the forbidden range {start} to {stop - 1}"
+            yield f"the forbidden range {extent(range(start, stop))}"
 
 
 def _stretches(ranges: Sequence[RangeConfig], area: str) -> Iterator[tuple[int, int]]:
