@@ -94,6 +94,19 @@ def sealed(runs: Iterable[InitialRun], gate: Cell) -> tuple[InitialRun, ...]:
     )
 
 
+def runs_of(cells: Iterable[tuple[int, int]]) -> Iterator[tuple[int, list[int]]]:
+    """The values of addresses in their order, as runs: a first address, and values from there."""
+    first, values = 0, list[int]()
+    for address, value in cells:
+        if values and address != first + len(values):
+            yield first, values
+            values = []
+        first = first if values else address
+        values.append(value)
+    if values:
+        yield first, values
+
+
 def _counts(areas: Mapping[str, range | None]) -> list[int]:
     return [len(addresses or range(ADDRESSES)) for addresses in areas.values()]
 
@@ -146,14 +159,9 @@ class _Judge:
     def runs(self) -> Iterator[InitialRun]:
         """The kept values as runs, in the order of their addresses."""
         for area, cells in self.kept.items():
-            first, values = 0, list[int]()
-            for address in sorted(cells):
-                if values and address != first + len(values):
-                    yield InitialRun(area, first, tuple(values))
-                    values = []
-                first = first if values else address
-                values.append(cells[address][0])
-            yield InitialRun(area, first, tuple(values))
+            kept = sorted((address, value) for address, (value, _) in cells.items())
+            for first, values in runs_of(kept):
+                yield InitialRun(area, first, tuple(values))
 
 
 def _csv(text: str, judge: _Judge) -> Iterator[_Given]:

@@ -11,7 +11,7 @@ import click
 from holdfast import _core
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import require_known
-from holdfast.config.initial_values import KINDS
+from holdfast.config.initial_values import KINDS, runs_of
 from holdfast.runtime.text import listing
 from holdfast.types import BIT_AREAS
 
@@ -37,6 +37,10 @@ class KeptArea(NamedTuple):
     def addresses(self) -> range:
         """The addresses."""
         return range(self.start, self.start + len(self.values))
+
+    def cells(self, *, zeros: bool) -> Iterator[tuple[int, int]]:
+        """Addresses and values; those with the value 0 only with `zeros`."""
+        return ((at, value) for at, value in enumerate(self.values, self.start) if value or zeros)
 
 
 def contents(file: Path, *, set_aside: bool = False) -> dict[str, dict[Area, KeptArea]]:
@@ -123,29 +127,19 @@ def write(file: Path, text: str) -> None:
 
 
 def _csv_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
-    """Lines of area,address,value; those with the value 0 only with `zeros`."""
+    """Lines of area,address,value."""
     yield "area,address,value"
     for area, kept in areas.items():
-        for address, value in zip(kept.addresses, kept.values, strict=True):
-            if value or zeros:
-                yield f"{area},{address},{value}"
+        for address, value in kept.cells(zeros=zeros):
+            yield f"{area},{address},{value}"
 
 
 def _yaml_lines(areas: Mapping[Area, KeptArea], *, zeros: bool) -> Iterator[str]:
     """Areas with runs of values: `ADDRESS: [VALUE, …]`."""
     for area, kept in areas.items():
         yield f"{area}:" if any(kept.values) or zeros else f"{area}: {{}}"
-        first, run = 0, list[int]()
-        for address, value in zip(kept.addresses, kept.values, strict=True):
-            if not value and not zeros:
-                continue
-            if run and address != first + len(run):
-                yield f"  {first}: {run}"
-                run = []
-            first = first if run else address
-            run.append(value)
-        if run:
-            yield f"  {first}: {run}"
+        for first, values in runs_of(kept.cells(zeros=zeros)):
+            yield f"  {first}: {values}"
 
 
 def _values(area: Area, size: int, data: bytes) -> list[int]:
