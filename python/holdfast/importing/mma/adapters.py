@@ -76,11 +76,10 @@ class Adapters(Reader):
         self.desk.check(path, f"{message}, and none of them can access it")
 
     def _rest(self, rest: Section) -> None:
-        address = rest.get("address")
-        bind = None if address is None else self.binds.read(rest.at("address"), address)
+        bind = self.binds.at(rest, "address")
         tokens = self._tokens(rest)
         rest.close()
-        if address is None:
+        if rest.get("address") is None:
             self.desk.left_out(rest.path, "REST is left out: it has no address")
         if bind is None:
             return
@@ -278,10 +277,7 @@ class Adapters(Reader):
         return url
 
     def _raw_ingest(self, raw: Section) -> None:
-        listen = raw.get("listen")
-        if listen is None:
-            self.desk.problem_of_key(raw.at("listen"), "missing, allowed: :port or address:port")
-        bind = None if listen is None else self.binds.read(raw.at("listen"), listen)
+        bind = self.binds.at(raw, "listen", required=True)
         timeout = raw.integer("read_timeout_ms", 1, MAX_TIMEOUT_MS)
         raw.close({"max_packet_bytes": "a packet is as long as its count says, up to a whole area"})
         memories = self.draft.written_by_raw_ingest()

@@ -9,6 +9,7 @@ from holdfast.config.values.ip_addresses import Bind, parse_bind
 
 if TYPE_CHECKING:
     from holdfast.config.text.yaml_document import KeyPath
+    from holdfast.importing.key_reader import Section
     from holdfast.importing.notes import Choices, Desk
 
 FORM = "a port, :port or address:port with an IP address"
@@ -21,6 +22,15 @@ class Binds:
         self._desk = desk
         self._choices = choices
         self._taken: list[tuple[KeyPath, Bind]] = []
+
+    def at(self, parent: Section, key: str, *, required: bool = False) -> Bind | None:
+        """The address and port at a key; `None` if there is none."""
+        value = parent.get(key)
+        if value is not None:
+            return self.read(parent.at(key), value)
+        if required:
+            self._desk.problem_of_key(parent.at(key), "missing, allowed: :port or address:port")
+        return None
 
     def read(self, path: KeyPath, value: object, *, of_key: bool = False) -> Bind | None:
         """The address and port of `value`; `None`, and a problem, if it is not valid."""

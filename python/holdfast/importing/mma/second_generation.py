@@ -109,11 +109,7 @@ class SecondGeneration(Reader):
             memory.name = name
 
     def _listener(self, name: str, listener: Section, memories: list[_Memory]) -> None:
-        listen = listener.get("listen")
-        if listen is None:
-            message = "missing, allowed: :port or address:port"
-            self.desk.problem_of_key(listener.at("listen"), message)
-        bind = None if listen is None else self.binds.read(listener.at("listen"), listen)
+        bind = self.binds.at(listener, "listen", required=True)
         listener.close()
         policies = [self._memory(memory) for memory in memories]
         known = [policy for policy in policies if policy is not None]
@@ -133,8 +129,8 @@ class SecondGeneration(Reader):
         for policy in unserved(known, rules):
             message = f"no rule serves unit {policy.unit}: it allows no function for its areas"
             self.desk.check(listener.path, message)
-        listen = {"type": "modbus-tcp", **common}
-        self.draft.listeners[name] = {**listen, "rules": rules, "raw_ingest": raw}
+        made = {"type": "modbus-tcp", **common, "rules": rules, "raw_ingest": raw}
+        self.draft.listeners[name] = made
 
     def _raw_ingest(
         self, listener: Section, memories: list[_Memory], admitted: Peers
