@@ -50,9 +50,9 @@ class UnitRights:
     functions: Codes | None
     """The allowed function codes, `None` for all that `deny` does not exclude."""
     deny: Codes | None
-    read: tuple[RangeConfig, ...] | None
+    read: tuple[RangeConfig, ...] | None = None
     """The ranges that may be read, `None` for everything."""
-    write: tuple[RangeConfig, ...] | None
+    write: tuple[RangeConfig, ...] | None = None
     """The ranges that may be written, `None` for everything."""
     exception_status: ExceptionStatusConfig | None = None
     """The bits that function 7 reads."""
@@ -117,21 +117,13 @@ def items(ranges: tuple[RangeConfig, ...]) -> list[tuple[Area, int, int]]:
 
 def _rights(rule: AnyRule, target: str | UnitMemoryConfig | RouteConfig) -> UnitRights:
     if isinstance(target, str):
-        return UnitRights(target, None, rule.access, rule.functions, rule.deny, None, None)
+        return UnitRights(target, None, rule.access, rule.functions, rule.deny)
     functions, deny = narrowed(rule.functions, rule.deny, target.functions, target.deny)
     access = target.access or rule.access
     if isinstance(target, RouteConfig):
-        return UnitRights(None, target.route, access, functions, deny, None, None)
-    return UnitRights(
-        target.memory,
-        None,
-        access,
-        functions,
-        deny,
-        target.read,
-        target.write,
-        target.exception_status,
-    )
+        return UnitRights(None, target.route, access, functions, deny)
+    own = target.read, target.write, target.exception_status
+    return UnitRights(target.memory, None, access, functions, deny, *own)
 
 
 def narrowed(

@@ -101,13 +101,13 @@ def _raw_target(value: object) -> str:
     return _name(value)
 
 
-def _id_of(what: str, least: int, most: int, note: str = "") -> Callable[[object], int]:
+def _id_of(what: str, least: int, most: int) -> Callable[[object], int]:
     """A validator for integers from `least` to `most`."""
 
     def number(value: object) -> int:
         if type(value) is int and least <= value <= most:
             return value
-        form = f"{what} from {least} to {most}{note}{_unquoted(value)}"
+        form = f"{what} from {least} to {most}{_unquoted(value)}"
         raise ValueError(f"found {show(value)}, allowed: {form}")
 
     return number
