@@ -43,7 +43,9 @@ def check_memories(scope: Scope) -> None:
     with until_invalid():
         ids = Owners(scope.report, "id")
         for path, memory in items(("memories",), scope.config.memories):
-            _check_areas(scope, path, memory)
+            if not layout(memory):
+                words = f"no area, allowed: at least one of {listing(AREAS)}"
+                scope.report.add_key(path, words)
             with until_invalid():
                 _check_fifo(scope, (*path, "fifo"), memory)
             with until_invalid():
@@ -81,11 +83,6 @@ def area_of(scope: Scope, path: KeyPath, name: str, area: Area) -> range | None:
     message = f"found {show(area)}, an area that {name} does not have, {allowed}"
     scope.report.add((*path, "area"), message)
     return None
-
-
-def _check_areas(scope: Scope, path: KeyPath, memory: MemoryConfig) -> None:
-    if not layout(memory):
-        scope.report.add_key(path, f"no area, allowed: at least one of {listing(AREAS)}")
 
 
 def _check_fifo(scope: Scope, path: KeyPath, memory: MemoryConfig) -> None:

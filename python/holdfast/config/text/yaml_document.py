@@ -247,10 +247,8 @@ def _events(text: str, file: str, max_written: int) -> Iterable[YamlEvent]:
         line = text[: found.start()].count("\n") + 1
         raise _error(file, f"the character U+{ord(found[0]):04X} is not allowed in YAML", line)
     # Text without a value has no events, from either parser.
-    return yaml_events(text, max_written) or _slow_events(text, file)
-
-
-def _slow_events(text: str, file: str) -> Iterator[YamlEvent]:
+    if events := yaml_events(text, max_written):
+        return events
     from holdfast.config.text import slow_yaml  # Few files need it, and its library takes 30 ms.
 
     return slow_yaml.events(text, file)
