@@ -85,7 +85,7 @@ _EXCEPTION = f"Share of requests with an exception.  [default code: {DEFAULT_EXC
 @click.argument("file", type=FILE, required=False)
 @option("--profile", "NAME", "FILE is a configuration; simulate this profile of it.")
 @bind_option(5020, "Address and port of the Modbus TCP listener; port 0 lets the system pick one.")
-@source_option()
+@source_option
 @unit_option()
 @option("--set chosen", "NAME=GENERATOR", _SET, multiple=True)
 @file_option("--play", "Play back this CSV file, a row at a time, with a column for each tag.")

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 
     from holdfast.net.addresses import Network
 
-SOURCE_HELP = "Clients that may connect; repeatable. Default: this machine."
-
 
 def bind_option(port: int | None, help: str) -> Callable[[Command], Command]:
     """Adds `--bind`; `port` is the default one. The address or the port may be left out."""
@@ -53,9 +51,9 @@ def unbindable(bind: Bind, error: OSError) -> str:
     return f"can't listen on {bind}: {explained(error).rpartition(f'{bind}: ')[2]}"
 
 
-def source_option(help: str = SOURCE_HELP) -> Callable[[Command], Command]:
-    """Adds `--source`."""
-    return option("--source sources", "NETWORK", help, parsed_by(parse_source), multiple=True)
+_HELP = "Clients that may connect; repeatable. Default: this machine."
+source_option = option("--source sources", "NETWORK", _HELP, parsed_by(parse_source), multiple=True)
+"""Adds `--source`."""
 
 
 def require_source(bind: Bind, sources: Sequence[Network]) -> None:

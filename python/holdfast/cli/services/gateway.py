@@ -49,7 +49,7 @@ _HOST = "Name under which clients without tokens may reach the gateway; repeatab
 )
 @choice("--access", "read-write: requests may write to devices.", get_args(Access), "read-only")
 @option("--tokens token_file", "FILE", _TOKENS, click.Path(path_type=Path))
-@source_option()
+@source_option
 @option("--host hosts", "NAME", _HOST, parsed_by(parse_host_name), multiple=True)
 @choice("--compat", "Accept the requests of this program, and send its errors.", get_args(Compat))
 @tls_options("device", "device_tls", DEVICES, " for devices")

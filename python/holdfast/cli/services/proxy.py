@@ -72,7 +72,7 @@ def parse_functions(text: str) -> list[int]:
 @click.command(epilog="Example: holdfast proxy 'rtu:///dev/ttyUSB0?baud=9600' --access read-only")
 @click.argument("url", type=checked_url, metavar="DEVICE-URL")
 @bind_option(5050, "Address and port of the Modbus TCP listener.")
-@source_option()
+@source_option
 @choice("--access", "read-only: refuse requests that may write.", get_args(Access), "read-write")
 @option("--functions", "LIST", _FUNCTIONS, parsed_by(parse_functions))
 @unit_option(None, "Send all requests to unit N. Default: unit ids pass through.")
