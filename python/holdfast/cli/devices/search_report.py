@@ -34,14 +34,12 @@ class Ended:
     def __str__(self) -> str:
         return self.detail
 
-    def to_json(self) -> dict[str, object]:
-        """The reason for JSON."""
-        return {key: value for key, value in asdict(self).items() if value is not None}
-
 
 def ended_to_json(why: Ended | None) -> dict[str, object]:
     """Whether all that was asked is there, and if not, why."""
-    return {"ok": True} if why is None else {"ok": False, **why.to_json()}
+    if why is None:
+        return {"ok": True}
+    return {"ok": False, **{key: value for key, value in asdict(why).items() if value is not None}}
 
 
 RANGE = "{:17}  {:>5}  {:>5}  {:>5}"

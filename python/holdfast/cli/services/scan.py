@@ -317,10 +317,11 @@ def _taken_over(reading: FileWork[bool]) -> bool:
 
 def _greeting(settings: Settings) -> str:
     prefix, fleet = settings.prefix, settings.fleet
+    servers = ", ".join(str(without_secrets(url)) for url in settings.servers.urls)
     is_next = settings.dialect == "tentacle-next"
     data = f"{prefix}.data.DEVICE.TAG" if is_next else f"{prefix}.data.DEVICE"
     lines = [
-        f"Scanning for subscribers at {', '.join(_without_secrets(settings.servers))}.",
+        f"Scanning for subscribers at {servers}.",
         "",
         f"  requests   {prefix}.subscribe, {prefix}.unsubscribe, {prefix}.browse, "
         f"{prefix}.variables",
@@ -343,7 +344,3 @@ def _write_access(settings: Settings) -> Iterator[str]:
     for key in ("by", "narrowed_by", "set_by"):
         if key in found:
             yield f"             {key.replace('_', ' ')} {found[key]}"
-
-
-def _without_secrets(servers: Servers) -> Iterator[str]:
-    return (str(without_secrets(url)) for url in servers.urls)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
@@ -66,7 +66,9 @@ def items(words: Sequence[str], *, modicon: bool, encoding: str | None) -> TagLi
             raise click.UsageError(f"{each.text!r}: more than {MAX_TAGS} values.")
     names = Counter(tag.name for tag, _ in found)
     try:
-        return TagList(_renamed(tag, full) if names[tag.name] > 1 else tag for tag, full in found)
+        return TagList(
+            replace(tag, name=full) if names[tag.name] > 1 else tag for tag, full in found
+        )
     except TagError as error:
         raise click.UsageError(str(error)) from error
 
@@ -100,7 +102,3 @@ def _tag(area: Area, address: int, kind: str, order: str, encoding: str | None) 
 def _named(tag: Tag) -> tuple[Tag, str]:
     order = "" if tag.order == "ABCD" else f":{tag.order}"
     return tag, f"{tag.name}:{tag.type}{order}"
-
-
-def _renamed(tag: Tag, name: str) -> Tag:
-    return _ItemTag(name, tag.area, tag.address, tag.type, tag.order, tag.encoding)
