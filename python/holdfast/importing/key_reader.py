@@ -109,7 +109,7 @@ class Section:
         if isinstance(value, str):
             text = value.strip()
             if required and not text:
-                self.desk.problem(self.at(key), "found an empty text, allowed: text")
+                self.problem(key, "found an empty text, allowed: text")
             return text or None
         self._wrong(key, value, "text")
         return None
@@ -124,7 +124,7 @@ class Section:
         value = self.get(key)
         if value is None or isinstance(value, str):
             return value or None
-        self.desk.problem(self.at(key), "not text (value hidden), allowed: text in quotes")
+        self.problem(key, "not text (value hidden), allowed: text in quotes")
         return None
 
     def word(
@@ -138,7 +138,27 @@ class Section:
         self._wrong(key, value, either(allowed))
         return None
 
-    def leave_out(self, message: str) -> None:
+    def problem(self, key: str | int, message: str) -> None:
+        """Adds a problem with the value at a key."""
+        self.desk.problem(self.at(key), message)
+
+    def problem_of_key(self, key: str | int, message: str) -> None:
+        """Adds a problem with a key itself, such as a missing one."""
+        self.desk.problem_of_key(self.at(key), message)
+
+    def left_out(self, key: str | int, message: str) -> None:
+        """Notes that the result does not have what is at a key."""
+        self.desk.left_out(self.at(key), message)
+
+    def changed(self, key: str | int, message: str) -> None:
+        """Notes that what is at a key is converted differently."""
+        self.desk.changed(self.at(key), message)
+
+    def check(self, key: str | int, message: str) -> None:
+        """Notes that a person must check what is at a key."""
+        self.desk.check(self.at(key), message)
+
+    def leave_out_all(self, message: str) -> None:
         """Notes that the result does not have what this mapping describes, with all its keys."""
         self.desk.left_out(self.path, message)
         self._asked.update(self.data)
@@ -152,7 +172,7 @@ class Section:
             if key in self._asked:
                 continue
             message = (reasons or {}).get(key) or f"unknown key{suggestion(key, known)}"
-            self.desk.left_out(self.at(key), message)
+            self.left_out(key, message)
 
     def _has_problem(self) -> bool:
         """Whether a key of this mapping has a problem itself."""
@@ -173,12 +193,12 @@ class Section:
         if self.desk.document.spell(self.at(key)) in self.desk.broken:
             return None
         if value is None and required:
-            self.desk.problem_of_key(self.at(key), f"missing, allowed: {allowed}")
+            self.problem_of_key(key, f"missing, allowed: {allowed}")
         return value
 
     def _wrong(self, key: str | int, value: object, allowed: str) -> None:
         if value is not None:
-            self.desk.problem(self.at(key), f"found {show(value)}, allowed: {allowed}")
+            self.problem(key, f"found {show(value)}, allowed: {allowed}")
 
 
 def section(desk: Desk, path: KeyPath, value: object) -> Section | None:

@@ -72,16 +72,16 @@ class _Units:
         sections = replicator.sections("units", required=True)
         replicator.close(_TOP_REASONS)
         if replicator.get("units") == []:
-            self.desk.problem(replicator.at("units"), "no unit, allowed: at least one")
+            replicator.problem("units", "no unit, allowed: at least one")
         wanted = [(each.at("id"), each.name("id", required=True) or "unit") for each in sections]
         devices = [self._device(each) for each in sections]
         names = unique_names(self.desk, wanted)
         kept = {name: each for name, each in zip(names, devices, strict=True) if each}
         if sections and not kept and not self.desk.report.problems:
-            self.desk.problem(replicator.at("units"), "no unit has a target that is written")
+            replicator.problem("units", "no unit has a target that is written")
         if kept:
             partly = "if a read of a device fails, the others are written; the source wrote none"
-            self.desk.check(replicator.at("units"), partly)
+            replicator.check("units", partly)
         self._retry(kept.values())
         return kept
 
@@ -127,7 +127,7 @@ class _Units:
         poll.close()
         if given is not None and given < MIN_INTERVAL_S * 1000:
             message = f"raised to {MIN_INTERVAL_S * 1000:g} ms, the shortest interval"
-            self.desk.changed(poll.at("interval_ms"), message)
+            poll.changed("interval_ms", message)
             return MIN_INTERVAL_S
         return None if given is None else seconds(given)
 
@@ -150,8 +150,7 @@ class _Units:
         except ValueError:
             port = None
         if port is None:
-            message = f"found {show(text)}, allowed: host:port, as in 10.5.1.29:502"
-            self.desk.problem(one.at("endpoint"), message)
+            one.problem("endpoint", f"found {show(text)}, allowed: host:port, as in 10.5.1.29:502")
             return None
         return joined(host, port)
 
@@ -160,19 +159,18 @@ class _Units:
         slot = source.integer("status_slot", 0, LAST_SLOT)
         name = source.name("device_name") or ""
         if not name.isascii():
-            message = f"found {show(name)}, allowed: ASCII characters"
-            self.desk.problem(source.at("device_name"), message)
+            source.problem("device_name", f"found {show(name)}, allowed: ASCII characters")
         if slot is None:
             return None
         if not has_targets:
             message = "found without targets, allowed: only with targets"
-            self.desk.problem_of_key(source.at("status_slot"), message)
+            source.problem_of_key("status_slot", message)
         shown = "".join(each if " " <= each <= "~" else "?" for each in name[:16])
         return {"area": "holding_registers", "slot": slot, "name": shown}
 
     def _reads(self, one: Section) -> Iterator[dict[str, Any]]:
         if one.get("reads") == []:
-            self.desk.problem(one.at("reads"), "no read, allowed: at least one")
+            one.problem("reads", "no read, allowed: at least one")
         for read in one.sections("reads", required=True):
             function = read.integer("fc", 1, 4, required=True, what="a function")
             address = read.integer("address", 0, LAST_ADDRESS) or 0
@@ -180,14 +178,13 @@ class _Units:
             for key in ("invert", "addinvert"):
                 # The source ignored them for registers.
                 if read.flag(key) and function in (1, 2):
-                    message = "found true, allowed: false; nothing here inverts bits"
-                    self.desk.problem(read.at(key), message)
+                    read.problem(key, "found true, allowed: false; nothing here inverts bits")
             read.close(_READ_REASONS)
             if function is None or count is None:
                 continue
             if address + count > ADDRESSES:
                 allowed = f"allowed: up to {ADDRESSES - address} from address {address}"
-                self.desk.problem(read.at("quantity"), f"found {count}, {allowed}")
+                read.problem("quantity", f"found {count}, {allowed}")
                 continue
             yield {"area": _AREAS[function], "address": address, "count": count}
 
@@ -210,11 +207,11 @@ class _Units:
             if isinstance(health, dict) and health.get("enabled") is not False:
                 message = "found a coil that tells whether the source answers, allowed: without"
                 hint = "nothing here writes it; stale of a device refuses old values"
-                self.desk.problem_of_key(target.at(key), f"{message}: {hint}")
+                target.problem_of_key(key, f"{message}: {hint}")
         target.close()
         if block is not None and status_unit is None:
             message = f"missing with status_slot, allowed: a unit id from 0 to {MAX_UNIT}"
-            self.desk.problem_of_key(target.at("status_unit_id"), message)
+            target.problem_of_key("status_unit_id", message)
         if number is None or endpoint is None:
             return
         if number > MAX_UNIT:
@@ -226,7 +223,7 @@ class _Units:
             return
         if unit is not None and unit != number:
             message = f"packets go to unit {number}, the id of the target, as before"
-            self.desk.left_out(target.at("unit_id"), message)
+            target.left_out("unit_id", message)
         wait = TARGET_TIMEOUT_S if timeout is None else timeout
         for index, added in enumerate(offsets):
             forward: dict[str, Any] = {"url": f"raw://{endpoint}", "unit": number, "timeout": wait}
@@ -257,10 +254,10 @@ class _Units:
         for function in list(given.data):
             if isinstance(function, str):
                 message = f"found {show(function)}, allowed: a function from 1 to 4, without quotes"
-                self.desk.problem_of_key(given.at(function), message)
+                given.problem_of_key(function, message)
                 continue
             if function not in _AREAS:
-                self.desk.left_out(given.at(function), "no read has this function, allowed: 1 to 4")
+                given.left_out(function, "no read has this function, allowed: 1 to 4")
                 continue
             area = _AREAS[function]
             most = ADDRESSES - max(

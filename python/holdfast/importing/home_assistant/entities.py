@@ -117,14 +117,13 @@ def _sensor(places: Places, entity: Section) -> None:
     scaled = _scaled(entity)
     if settings["type"].startswith("string"):
         for key in [key for key, value in scaled.items() if value is not None]:
-            entity.desk.left_out(entity.at(key), "a text has none")
+            entity.left_out(key, "a text has none")
             scaled[key] = None
     if _is_constant(entity, scaled):
         return
     found = parsed(settings["type"])
     if found.count is not None:
-        message = "a sensor for each value; the source had one text"
-        entity.desk.changed(entity.path, message)
+        entity.desk.changed(entity.path, "a sensor for each value; the source had one text")
     settings |= {"type": found.element, **scaled}
     settings["unit"] = entity.text("unit_of_measurement")
     settings["null"] = _null(entity, found.element)
@@ -159,7 +158,7 @@ def _is_constant(entity: Section, *scaled: dict[str, Any]) -> bool:
     if all(each["scale"] != 0 for each in scaled):
         return False
     message = f"{_name(entity)} has a scale of 0, with which all numbers are one value: add a tag"
-    entity.leave_out(message)
+    entity.leave_out_all(message)
     return True
 
 
@@ -177,18 +176,17 @@ def _typed(entity: Section) -> dict[str, Any] | None:
     if kind == "string":
         if count is None:
             message = "missing, allowed: the number of registers with the text"
-            entity.desk.problem_of_key(entity.at("count"), message)
+            entity.problem_of_key("count", message)
             return None
         return {"type": f"string:{2 * count}", "order": _ORDERS[swap], **_UTF_8}
     if kind in _FORMER_TYPES and f"{kind}{16 * (count or 1)}" in _TYPES:
         kind = f"{kind}{16 * (count or 1)}"
     if kind not in _TYPES:
-        message = f"found {count} with data_type {kind}, allowed: 1, 2 or 4"
-        entity.desk.problem(entity.at("count"), message)
+        entity.problem("count", f"found {count} with data_type {kind}, allowed: 1, 2 or 4")
         return None
     if count not in (None, register_count(kind)):
         message = f"found {count} with data_type {kind}, allowed: {register_count(kind)}"
-        entity.desk.problem(entity.at("count"), message)
+        entity.problem("count", message)
     return {"type": kind, "order": _ORDERS[swap]}
 
 
@@ -200,15 +198,15 @@ def _structure(
     number = int(found[2] or 1) if found else 0
     if found is None or not number:
         message = f"{_name(entity)} has the structure {show(structure)}, which is no type here"
-        entity.leave_out(f"{message}: add a tag for each value")
+        entity.leave_out_all(f"{message}: add a tag for each value")
         return None
     kind = _kind(found, number, count)
     if count not in (None, register_count(kind)):
         message = f"found {count} with this structure, allowed: {register_count(kind)}"
-        entity.desk.problem(entity.at("count"), message)
+        entity.problem("count", message)
     if number > 1 and swap in ("word", "word_byte") and found[3] != "s":
         message = f"found {swap} with several values, whose order it changes, allowed: none or byte"
-        entity.desk.problem(entity.at("swap"), message)
+        entity.problem("swap", message)
     if found[3] == "s":
         return {"type": kind, "order": _ORDERS[swap], **_UTF_8}
     # Without a sign, the source used the order of its processor, which is the little one.
@@ -237,14 +235,14 @@ def _null(entity: Section, kind: str) -> list[int | float]:
     except ValueError:
         number = _hexadecimal(given)
     if type(number) is not int:
-        entity.desk.problem(entity.at("nan_value"), f"found {show(given)}, allowed: an integer")
+        entity.problem("nan_value", f"found {show(given)}, allowed: an integer")
         return []
     if kind not in _TYPES:
-        entity.desk.left_out(entity.at("nan_value"), f"values of type {kind} have none")
+        entity.left_out("nan_value", f"values of type {kind} have none")
         return []
     candidates = sorted({number, -number})
     if number == 0:
-        entity.desk.check(entity.at("nan_value"), "0 is no value, as in newer versions")
+        entity.check("nan_value", "0 is no value, as in newer versions")
     return [each for each in candidates if _fits(each, kind)]
 
 
@@ -328,8 +326,7 @@ def _numbers(entity: Section, key: str) -> list[int]:
     values = given if isinstance(given, list) else [] if given is None else [given]
     if all(type(value) is int and 0 <= value <= 65535 for value in values):
         return values
-    message = f"found {show(given)}, allowed: integers from 0 to 65535"
-    entity.desk.problem(entity.at(key), message)
+    entity.problem(key, f"found {show(given)}, allowed: integers from 0 to 65535")
     return []
 
 
@@ -395,11 +392,10 @@ def _climate(places: Places, entity: Section) -> None:
     aim = _scaled(entity, "target_temp_")
     if not target:
         message = "missing, allowed: the address of the setpoint"
-        entity.desk.problem_of_key(entity.at("target_temp_register"), message)
+        entity.problem_of_key("target_temp_register", message)
     elif len(target) not in (1, len(_TARGET_MODES)):
         allowed = f"allowed: 1, or {len(_TARGET_MODES)}, for {', '.join(_TARGET_MODES)}"
-        message = f"found {len(target)} registers, {allowed}"
-        entity.desk.problem(entity.at("target_temp_register"), message)
+        entity.problem("target_temp_register", f"found {len(target)} registers, {allowed}")
     for key in _MODES:
         _mode(places, entity, key, writable=True)
     _mode(places, entity, "hvac_action_register", writable=False)
@@ -416,7 +412,7 @@ def _climate(places: Places, entity: Section) -> None:
         modes.setdefault(register, []).append(mode)
     if len(modes) > 1:
         message = "a number for each register, with its modes; the source used that of the mode"
-        entity.desk.changed(entity.at("target_temp_register"), message)
+        entity.changed("target_temp_register", message)
     places.add(_name(entity), area, address, **_given({**settings, **current, "unit": unit}))
     if register_count(settings["type"]) == 1:
         is_multiple = entity.flag("target_temp_write_registers") or False
@@ -433,11 +429,9 @@ def _limits(entity: Section) -> dict[str, float]:
     limits = {"min": 5 if least is None else least, "max": 35 if most is None else most}
     if limits["min"] > limits["max"]:
         if most is None:
-            message = f"found {least}, allowed: up to max_temp, {limits['max']}"
-            entity.desk.problem(entity.at("min_temp"), message)
+            entity.problem("min_temp", f"found {least}, allowed: up to max_temp, {limits['max']}")
         else:
-            message = f"found {most}, allowed: at least min_temp, {limits['min']}"
-            entity.desk.problem(entity.at("max_temp"), message)
+            entity.problem("max_temp", f"found {most}, allowed: at least min_temp, {limits['min']}")
     return limits
 
 
@@ -455,8 +449,7 @@ def _mode(places: Places, entity: Section, key: str, *, writable: bool) -> None:
         places.written[is_multiple].append(register.path)
     register.close()
     if not given or values is None:
-        message = "without address and values, allowed: with both"
-        entity.desk.problem(entity.at(key), message)
+        entity.problem(key, "without address and values, allowed: with both")
         return
     names = [(_PREFIX.sub("", str(key)), key) for key in values.data]
     names.sort(key=lambda each: _SEARCHED.index(each[0]) if each[0] in _SEARCHED else 99)

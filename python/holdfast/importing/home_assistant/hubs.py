@@ -338,7 +338,7 @@ class _Hub:
         given = self.hub.number("timeout") or TIMEOUT_S
         if not MIN_TIME <= given <= MAX_TIME:
             message = f"found {show(given)}, allowed: {MIN_TIME} to {MAX_TIME} seconds"
-            self.desk.problem(self.hub.at("timeout"), message)
+            self.hub.problem("timeout", message)
         return given
 
     @property
@@ -384,7 +384,7 @@ class _Hub:
         if len(unit.places.tags) == known:
             pass  # What is left out is not polled.
         elif interval == 0:
-            self.desk.changed(entity.at("scan_interval"), "polled with the others of its device")
+            entity.changed("scan_interval", "polled with the others of its device")
         elif interval is not None:
             unit.intervals.append((entity.at("scan_interval"), interval))
         else:
@@ -414,14 +414,14 @@ class _Hub:
         if method == "ascii":
             options["data_bits"] = bits
         elif bits == 7:
-            self.desk.problem(hub.at("bytesize"), "found 7 with method rtu, allowed: 8")
+            hub.problem("bytesize", "found 7 with method rtu, allowed: 8")
         scheme, mark, address = port.partition("://")
         url = f"{method}://{quote(port)}"
         if mark and scheme == "socket":
             url, options = f"{method}+tcp://{address}", {}
         elif mark:
             message = f"found {show(port)}, allowed: a serial port, or socket://host:port"
-            self.desk.problem(hub.at("port"), message)
+            hub.problem("port", message)
         elif not port.startswith("/"):
             url = f"{method}:///{quote(port)}"
         if (port and not mark) or scheme == "socket":
@@ -436,7 +436,7 @@ class _Hub:
         except ValueError as error:
             hidden = isinstance(self.hub.data.get(key), Secret)
             message = "found a secret, allowed: the address of a device" if hidden else str(error)
-            self.desk.problem(self.hub.at(key), message)
+            self.hub.problem(key, message)
 
     def _pauses(self, usual_wait_ms: int) -> None:
         """The pauses that the source made."""

@@ -185,7 +185,7 @@ class Adapters(Reader):
                 if len(secret) < MIN_TOKEN_CHARS:
                     message = f"the token has fewer than {MIN_TOKEN_CHARS} characters and can be"
                     text = f"{message} guessed; create one with `holdfast token`"
-                    self.desk.check(token.at("token"), text)
+                    token.check("token", text)
         digest = hashlib.sha256(INGEST_TOKEN.encode()).hexdigest()
         if self._keeps_ingest_token and digest not in found:
             found[digest] = (rest.path, "published")
@@ -230,9 +230,9 @@ class Adapters(Reader):
         if restored := self.draft.restored(grant["areas"]):
             grant["while_sealed"] = restored
             text = f"as it ran, messages may also write {_areas(restored)} while their memory"
-            self.desk.check(mqtt.at("topic"), f"{text} is sealed, to restore it: while_sealed")
+            mqtt.check("topic", f"{text} is sealed, to restore it: while_sealed")
         found["subscriptions"] = [{"topic": topic, "qos": QOS, **grant}]
-        self.desk.check(mqtt.at("topic"), f"the topic {_written('mqtt', grant['areas'])}")
+        mqtt.check("topic", f"the topic {_written('mqtt', grant['areas'])}")
         self.draft.mqtt = found
 
     def _is_topic(self, path: KeyPath, topic: str) -> bool:

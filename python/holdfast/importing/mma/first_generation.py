@@ -64,7 +64,7 @@ class FirstGeneration(Reader):
         for key in memories.data:
             one = memories.mapping(key)
             if one is None:
-                self.desk.problem(memories.at(key), "found nothing, allowed: a mapping")
+                memories.problem(key, "found nothing, allowed: a mapping")
                 continue
             self._memory(one, str(key), for_all)
         memory.close()
@@ -257,7 +257,7 @@ class FirstGeneration(Reader):
         more = functions.with_same_effect(deny) if access == "read-write" else []
         if more:
             message = f"also denies {functions.spelled(more)}, with the same effect as denied ones"
-            self.desk.changed(codes.at("deny"), f"{message}; the source had none of them")
+            codes.changed("deny", f"{message}; the source had none of them")
         return {"deny": [*deny, *more]}
 
     def _max_connections(self, policy: Section) -> int:
@@ -267,8 +267,7 @@ class FirstGeneration(Reader):
         allowed = DEFAULT_CONNECTIONS if most < 1 else min(most, MAX_CONNECTIONS)
         if allowed != most:
             integer = f"an integer from 1 to {MAX_CONNECTIONS}"
-            message = f"set to {allowed}, found {most}, allowed: {integer}"
-            self.desk.changed(policy.at("max_connections"), message)
+            policy.changed("max_connections", f"set to {allowed}, found {most}, allowed: {integer}")
         return allowed
 
 
@@ -279,5 +278,5 @@ def _list_or_all(policy: Section, key: str, what: str) -> list[tuple[KeyPath, An
         return policy.entries(key)
     found = "missing" if value is None else f"found {show(value)}"
     message = f"{found}, allowed: all or a list of {what}"
-    policy.desk.problem(policy.at(key), message, of_key=value is None)
+    (policy.problem_of_key if value is None else policy.problem)(key, message)
     return None

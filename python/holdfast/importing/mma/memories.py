@@ -50,11 +50,11 @@ def _long_form(memory: Section, area: str, size_key: str) -> dict[str, int] | in
 
 def _extent(memory: Section, area: str, start: int, size: int) -> dict[str, int] | int | None:
     if size == 0:
-        memory.desk.left_out(memory.at(area), "the area has no addresses")
+        memory.left_out(area, "the area has no addresses")
         return None
     if start + size > ADDRESSES:
         message = f"found start {start} and size {size}, allowed: a sum up to {ADDRESSES}"
-        memory.desk.problem(memory.at(area), message)
+        memory.problem(area, message)
         return None
     return {"start": start, "size": size} if start else size
 

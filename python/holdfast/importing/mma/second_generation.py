@@ -92,7 +92,7 @@ class SecondGeneration(Reader):
             if unit is not None and unit in first:
                 other = self.desk.document.spell(first[unit])
                 message = f"found {unit}, which is the unit id of {other}, allowed: a different one"
-                self.desk.problem(memory.at("unit_id"), message)
+                memory.problem("unit_id", message)
             elif unit is not None:
                 first[unit] = memory.path
             read.append(_Memory(memory, unit))
@@ -178,8 +178,7 @@ class SecondGeneration(Reader):
             self.desk.left_out(sealing.path, "not enabled")
             return None
         if exception not in (None, BUSY):
-            message = f"a sealed memory always returns 0x{BUSY:02X}"
-            self.desk.left_out(sealing.at("exception"), message)
+            sealing.left_out("exception", f"a sealed memory always returns 0x{BUSY:02X}")
         path = sealing.at("address")
         if address is None or not check_gate(self.desk, path, name, areas, "coils", address):
             return None

@@ -132,7 +132,7 @@ class _Import:
             self.interval = interval(agent) or INTERVAL_S
             agent.close({**dict.fromkeys(agent.data, NO_COUNTERPART), **_AGENT_REASONS})
         for one in self._sections("inputs", "modbus", "not a Modbus input", {}):
-            self.found += Input(self.desk, one, self.interval).devices()
+            self.found += Input(one, self.interval).devices()
         if not self.found and not self.desk.report.problems:
             message = "no inputs.modbus with a field that can be converted, allowed: at least one"
             self.desk.problem(("inputs",), message)
@@ -175,7 +175,7 @@ class _Import:
         measurement = _measurement(self.desk, fields) if sections else MEASUREMENT
         outputs: dict[str, dict[str, Any]] = {}
         for one in sections:
-            made = Influx(self.desk, one).read()
+            made = Influx(one).read()
             if made is None:
                 continue
             made |= {"measurement": measurement} if measurement != MEASUREMENT else {}
@@ -201,13 +201,13 @@ class _Import:
         for key in tags.data:
             value = tags.get(key)
             if not is_name(key):
-                self.desk.left_out(tags.at(key), f"a tag of an output has {NAME_FORM}")
+                tags.left_out(key, f"a tag of an output has {NAME_FORM}")
             elif key == "device":
-                self.desk.left_out(tags.at(key), "the tag device is the name of the device")
+                tags.left_out(key, "the tag device is the name of the device")
             elif isinstance(value, str) and value:
                 found[key] = value
             else:
-                self.desk.left_out(tags.at(key), "a tag without text is not written")
+                tags.left_out(key, "a tag without text is not written")
         return found
 
     def _compare(self, output: Section, fields: list[Field]) -> None:

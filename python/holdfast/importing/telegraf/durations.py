@@ -41,7 +41,7 @@ def seconds(section: Section, key: str) -> float | None:
             total = sum((Fraction(n) * _UNITS[unit] for n, unit in _PART.findall(text)), Fraction())
     if total is None or total > MAX_TIME:
         message = f"found {show(value)}, allowed: a duration of up to 366 days, as in '1m30s'"
-        section.desk.problem(section.at(key), message)
+        section.problem(key, message)
         return None
     return (int(total) if total.denominator == 1 else float(total)) or None
 
@@ -51,6 +51,6 @@ def interval(section: Section) -> float | None:
     found = seconds(section, "interval")
     if found is not None and found < MIN_INTERVAL_S:
         message = f"raised to {MIN_INTERVAL_S * 1000:g} ms, the shortest interval"
-        section.desk.changed(section.at("interval"), message)
+        section.changed("interval", message)
         return MIN_INTERVAL_S
     return found

@@ -129,7 +129,6 @@ class Unit:
 class Fields:
     """Reads the fields of one input, in the order of the file."""
 
-    desk: Desk
     source: Section
     location: str | None = None
     """Which bytes of a register contain text: `lower`, `upper`, or both."""
@@ -154,7 +153,7 @@ class Fields:
         found = [each for unit in self.units.values() for each in unit.fields if each.retyped]
         if any(each.tag.get("type", "bit:").startswith("bit:") for each in found):
             message = "bits without BOOL are true and false; the source had 1 and 0"
-            self.desk.changed(self.source.path, message)
+            self.source.desk.changed(self.source.path, message)
 
     def _unit(self, section: Section) -> Unit:
         number = section.integer("slave_id", 0, MAX_UNIT, what="a unit id")
@@ -189,7 +188,7 @@ class Fields:
         if entry.get("data_type") == "FLOAT32":
             message = "found FLOAT32, unsigned integers until Telegraf 1.36 and IEEE floats since"
             allowed = "allowed: UFIXED or FLOAT32-IEEE"
-            self.desk.problem(entry.at("data_type"), f"{message}, {allowed}")
+            entry.problem("data_type", f"{message}, {allowed}")
             return None
         return entry.word("data_type", _DATA_TYPES, required=True)
 
@@ -202,11 +201,11 @@ class Fields:
         for path, value in listed:
             if type(value) is not int or not 0 <= value <= LAST_ADDRESS:
                 message = f"found {value!r}, allowed: an address from 0 to {LAST_ADDRESS}"
-                self.desk.problem(path, message)
+                entry.desk.problem(path, message)
                 return None
         if not numbers or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
             message = f"found {listing(numbers) or 'no address'}, allowed: addresses that follow"
-            self.desk.problem(entry.at("address"), f"{message} each other, the lowest first")
+            entry.problem("address", f"{message} each other, the lowest first")
             return None
         return range(numbers[0], numbers[0] + len(numbers))
 
@@ -233,17 +232,16 @@ class Fields:
             return None
         if len(order) != 2 * count:
             message = f"found {order} with {count} addresses, allowed: {2 * count} letters"
-            self.desk.problem(entry.at("byte_order"), message)
+            entry.problem("byte_order", message)
             return None
         if not entry.get("scale"):
             message = "missing or 0, allowed: any other number; 1.0 leaves the value as it is"
-            self.desk.problem_of_key(entry.at("scale"), message)
+            entry.problem_of_key("scale", message)
             return None
         return self._number(entry, real, order_here, output)
 
     def _wrong_count(self, entry: Section, kind: str, count: int, allowed: str) -> None:
-        message = f"found {count} addresses, allowed with {kind}: {allowed}"
-        self.desk.problem(entry.at("address"), message)
+        entry.problem("address", f"found {count} addresses, allowed with {kind}: {allowed}")
 
     def _request(self, request: Section) -> None:
         """The style `request`: fields of one area."""
@@ -276,13 +274,13 @@ class Fields:
 
     def _entries(self, section: Section) -> list[Section]:
         if section.get("fields") == []:
-            self.desk.problem(section.at("fields"), "no field, allowed: at least one")
+            section.problem("fields", "no field, allowed: at least one")
         return section.sections("fields", required=True)
 
     def _leave_out_tags(self, section: Section) -> None:
         if section.get("tags"):
             message = "add an output with these tags, and with devices: that of this unit"
-            self.desk.left_out(section.at("tags"), message)
+            section.left_out("tags", message)
 
     def _gap(self, section: Section, default: int | None) -> int:
         """The largest gap that the source read to join two fields."""
@@ -291,7 +289,7 @@ class Fields:
         fill = section.integer("optimization_max_register_fill", 0, 2000)
         if kind == "aggressive":
             message = f"gaps of up to {DEFAULT_MAX_GAP} are read; see max_gap of the device"
-            self.desk.changed(section.at("optimization"), message)
+            section.changed("optimization", message)
             return DEFAULT_MAX_GAP
         return (fill or default or 0) if kind == "max_insert" else 0
 
@@ -326,7 +324,7 @@ class Fields:
         output = word(entry, "output", ("INT64", "UINT64", "FLOAT64", "STRING"))
         length, size = self._length(entry, kind)
         if kind is not None and (output == "STRING") > (kind == "STRING"):
-            self.desk.problem(entry.at("output"), "found STRING, allowed: only with type STRING")
+            entry.problem("output", "found STRING, allowed: only with type STRING")
         elif kind == "STRING" and length:
             found = self._text(entry, length, order)
         elif kind == "BIT":
@@ -342,12 +340,11 @@ class Fields:
         length = entry.integer("length", 0, LAST_ADDRESS, what="registers")
         bit = entry.get("bit")
         if kind != "STRING" and length:
-            self.desk.problem(entry.at("length"), f"found {length}, allowed: only with STRING")
+            entry.problem("length", f"found {length}, allowed: only with STRING")
         if kind == "STRING" and not entry.get("length"):
-            message = "missing, allowed: the number of registers"
-            self.desk.problem_of_key(entry.at("length"), message)
+            entry.problem_of_key("length", "missing, allowed: the number of registers")
         if kind != "BIT" and bit:
-            self.desk.problem(entry.at("bit"), f"found {bit}, allowed: only with BIT")
+            entry.problem("bit", f"found {bit}, allowed: only with BIT")
         if kind == "STRING":
             return length, length or 1
         return None, _SIZES.get(kind or "", 1)
@@ -359,19 +356,19 @@ class Fields:
     def _bit(self, entry: Section, order: str) -> Typed | None:
         number = entry.integer("bit", 0, 15, what="a bit")
         if entry.get("scale"):
-            self.desk.left_out(entry.at("scale"), "the source ignored it for bits")
+            entry.left_out("scale", "the source ignored it for bits")
         return {"type": f"bit:{number or 0}", **_order(_OF_ONE_REGISTER[order])}, True
 
     def _text(self, entry: Section, count: int, order: str) -> Typed | None:
         """Text of registers in their order, whatever the order of bytes is."""
         if entry.get("scale"):
-            self.desk.left_out(entry.at("scale"), "the source ignored it for text")
+            entry.left_out("scale", "the source ignored it for text")
         if self.location in ("lower", "upper"):
             message = f"text in the {self.location} byte of each register: there is no such type"
-            self.desk.left_out(entry.path, f"{message}; read the registers as uint16[{count}]")
+            entry.desk.left_out(entry.path, f"{message}; read the registers as uint16[{count}]")
             return None
         message = "all NULs at its end are removed, not only one; other text than UTF-8 is an error"
-        self.desk.changed(entry.path, message)
+        entry.desk.changed(entry.path, message)
         settings = {"type": f"string:{2 * count}", **_order(_OF_ONE_REGISTER[order])}
         return {**settings, "encoding": "utf-8"}, False
 
@@ -380,18 +377,16 @@ class Fields:
         scale = entry.number("scale") or 1
         if kind in _BYTES:
             message = f"no type has one byte ({kind}): read the register as uint16, or its bits"
-            self.desk.left_out(entry.path, message)
+            entry.desk.left_out(entry.path, message)
             return None
         is_float, as_integer = kind.startswith("FLOAT"), output not in ("native", "FLOAT64")
         if is_float and as_integer:
-            message = f"found {output} with {kind}, allowed: FLOAT64"
-            self.desk.problem(entry.at("output"), message)
+            entry.problem("output", f"found {output} with {kind}, allowed: FLOAT64")
             return None
         is_whole = float(scale).is_integer()
         was_float = is_float or output == "FLOAT64"
         if not was_float and not is_whole:
-            message = "digits behind the point are kept; the source dropped them"
-            self.desk.changed(entry.at("scale"), message)
+            entry.changed("scale", "digits behind the point are kept; the source dropped them")
         if not was_float:
             key, kept = ("scale", kind) if output == "native" else ("output", output)
             factor = int(scale) if is_whole else scale
@@ -399,7 +394,7 @@ class Fields:
             least, most = limits(_TYPES[kept])
             if min(ends) < least or max(ends) > most:
                 message = f"numbers beyond {kept} stay as they are; the source had other ones"
-                self.desk.changed(entry.at(key), message)
+                entry.changed(key, message)
         settings = {"type": _TYPES[kind]}
         settings |= _order(_OF_ONE_REGISTER[order] if _SIZES[kind] == 1 else order)
         becomes_float = is_float or kind == "UINT64" or not is_whole
@@ -421,7 +416,7 @@ class Fields:
             return
         if addresses.stop > ADDRESSES:
             message = f"found {addresses.start}, allowed: up to {ADDRESSES - len(addresses)}"
-            self.desk.problem(entry.at("address"), message)
+            entry.problem("address", message)
             return
         settings, retyped = found
         tag = {"area": area, "address": addresses.start, **settings}

@@ -16,7 +16,6 @@ from holdfast.net.addresses import joined
 
 if TYPE_CHECKING:
     from holdfast.importing.key_reader import Section
-    from holdfast.importing.notes import Desk
 
 INFLUX_URL = "http://localhost:8086"
 TOKEN_FILE = "token.txt"
@@ -34,7 +33,6 @@ _OUTPUT_REASONS = {
 class Influx:
     """Reads an output for InfluxDB 2."""
 
-    desk: Desk
     output: Section
 
     SHOWN = (
@@ -66,14 +64,13 @@ class Influx:
         if address is None:
             return None
         if has_token:
-            message = f"put the token into {TOKEN_FILE}, next to the new configuration"
-            self.desk.check(out.at("token"), message)
+            out.check("token", f"put the token into {TOKEN_FILE}, next to the new configuration")
         return {**made, **address, **self._tls(files, address["url"])}
 
     def _tls(self, files: dict[str, str | None], url: str) -> dict[str, Any]:
         given = {key: value for key, value in files.items() if value is not None}
         if given and not url.startswith("https:"):
-            self.desk.left_out(self.output.at("urls"), "TLS files without https://")
+            self.output.left_out("urls", "TLS files without https://")
             return {}
         return {"tls": given} if given else {}
 
@@ -82,18 +79,18 @@ class Influx:
         out = self.output
         given = out.get("urls")
         if not isinstance(given, list | None):
-            self.desk.problem(out.at("urls"), f"found {shape(given)}, allowed: a list of URLs")
+            out.problem("urls", f"found {shape(given)}, allowed: a list of URLs")
             return None
         urls = given or [INFLUX_URL]
         if len(urls) > 1:
-            self.desk.changed(out.at("urls"), "only the first URL is used")
+            out.changed("urls", "only the first URL is used")
         if bucket is None:
-            self.desk.left_out(out.path, "it has no bucket")
+            out.desk.left_out(out.path, "it has no bucket")
             return None
         try:
             target = parse_http(urls[0])
         except ValueError as error:
-            self.desk.left_out(out.path, str(error))  # The message does not repeat the URL.
+            out.desk.left_out(out.path, str(error))  # The message does not repeat the URL.
             return None
         query = {**({"org": org} if org else {}), "bucket": bucket}
         if target.path in ("", "/"):

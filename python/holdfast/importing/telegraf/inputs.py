@@ -67,7 +67,6 @@ class Device:
 class Input:
     """Reads one input."""
 
-    desk: Desk
     input: Section
     agent_interval: float | None
     """`None` if the file has no agent: that can be in another file."""
@@ -82,7 +81,7 @@ class Input:
         timing = {"interval": self._interval(), "timeout": self._timeout()}
         location = self._workarounds()
         self._busy()
-        fields = Fields(self.desk, one, location)
+        fields = Fields(one, location)
         style = fields.read()
         self._rename_measurements(fields)
         others = {key for each in STYLES if each != style for key in STYLES[each]}
@@ -97,35 +96,35 @@ class Input:
             data: dict[str, Any] = {"url": url, "unit": number, **timing}
             if self.tolerance:
                 data["tolerance"] = dict(self.tolerance)
-            data |= {"max_gap": unit.max_gap, **self.limits, "tags": unit.tags(self.desk)}
+            data |= {"max_gap": unit.max_gap, **self.limits, "tags": unit.tags(one.desk)}
             made.append(Device(one.at("name"), name, number, data, unit.fields))
         return made
 
     def _check_serial_unit(self, number: int) -> None:
         if not 1 <= number <= MAX_SERIAL_UNIT:
             allowed = f"allowed on a serial line: 1 to {MAX_SERIAL_UNIT}"
-            self.desk.problem(self.input.path, f"found slave_id {number}, {allowed}")
+            self.input.desk.problem(self.input.path, f"found slave_id {number}, {allowed}")
 
     def _interval(self) -> float:
         given = self.input.get("interval")
         if given is not None and not isinstance(given, str):
             message = "the source ignored an interval that is not text; see that of the agent"
-            self.desk.left_out(self.input.at("interval"), message)
+            self.input.left_out("interval", message)
             return self.agent_interval or INTERVAL_S
         found = interval(self.input)
         if found is None and self.agent_interval is None:
             message = f"no agent in this file: {INTERVAL_S} s, the default of the source"
-            self.desk.check(self.input.path, message)
+            self.input.desk.check(self.input.path, message)
         return found or self.agent_interval or INTERVAL_S
 
     def _timeout(self) -> float:
         given = seconds(self.input, "timeout")
         if given is None:
             message = f"no timeout: {TIMEOUT_S} s; the source waited without an end"
-            self.desk.check(self.input.path, message)
+            self.input.desk.check(self.input.path, message)
             return TIMEOUT_S
         if given < MIN_TIME:
-            self.desk.changed(self.input.at("timeout"), "raised to 1 ms, the shortest timeout")
+            self.input.changed("timeout", "raised to 1 ms, the shortest timeout")
         return max(given, MIN_TIME)
 
     def _rename_measurements(self, fields: Fields) -> None:
@@ -143,11 +142,11 @@ class Input:
         times = self.input.integer("busy_retries", 0, 1_000_000)
         if self.input.get("busy_retries_wait") is not None:
             message = "the pause before a retry is at least 0.1 s; see pause of tolerance"
-            self.desk.left_out(self.input.at("busy_retries_wait"), message)
+            self.input.left_out("busy_retries_wait", message)
         if times:
             self.tolerance |= {"retries": min(times, MAX_RETRIES), "retry_busy": True}
             message = f"{min(times, MAX_RETRIES)} retries, also after timeouts and lost connections"
-            self.desk.changed(self.input.at("busy_retries"), message)
+            self.input.changed("busy_retries", message)
 
     def _workarounds(self) -> str | None:
         """Reads the table of workarounds. Returns where text is in registers."""
@@ -160,14 +159,13 @@ class Input:
         ):
             pause = seconds(table, key)
             if pause is not None and pause > MAX_PAUSE_S:
-                message = f"found {pause} seconds, allowed: up to {MAX_PAUSE_S}"
-                self.desk.problem(table.at(key), message)
+                table.problem(key, f"found {pause} seconds, allowed: up to {MAX_PAUSE_S}")
             elif pause is not None:
                 self.tolerance[ours] = pause
         if table.flag("close_connection_after_gather"):
             self.tolerance["close_after"] = 1
             message = "the connection is closed after each request"
-            self.desk.changed(table.at("close_connection_after_gather"), message)
+            table.changed("close_connection_after_gather", message)
         for key, ours, most in (
             ("max_bit_registers_per_request", "max_bits", READ_BITS),
             ("max_word_registers_per_request", "max_registers", READ_REGISTERS),
@@ -177,11 +175,11 @@ class Input:
         location = table.text("string_register_location")
         if location not in (None, "both", "lower", "upper"):
             message = f"found {show(location)}, allowed: both, lower or upper"
-            self.desk.problem(table.at("string_register_location"), message)
+            table.problem("string_register_location", message)
         for key in ("one_request_per_field", "read_coils_starting_at_zero"):
             if table.flag(key):
                 message = "requests are planned from all tags; see max_registers and max_bits"
-                self.desk.left_out(table.at(key), message)
+                table.left_out(key, message)
         table.close()
         return location
 
@@ -211,8 +209,7 @@ class Input:
 
     def _wrong_controller(self, text: str) -> None:
         forms = "tcp://host:502, file:///dev/ttyUSB0 or COM1"
-        message = f"found {show(text)}, allowed: {forms}"
-        self.desk.problem(self.input.at("controller"), message)
+        self.input.problem("controller", f"found {show(text)}, allowed: {forms}")
 
     def _mode(self, modes: Mapping[str, str]) -> str:
         first = next(iter(modes.values()))
@@ -224,7 +221,7 @@ class Input:
         mode = self._mode(_NETWORK_MODES)
         for key in _SERIAL_KEYS:
             if self.input.get(key) is not None:
-                self.desk.left_out(self.input.at(key), "the source used it for serial lines only")
+                self.input.left_out(key, "the source used it for serial lines only")
         return None if port is None else f"{mode}://{joined(host, port)}"
 
     def _serial_url(self, device: str) -> str | None:
@@ -240,7 +237,7 @@ class Input:
             options["data_bits"] = bits
         elif bits != 8:
             allowed = "7 or 8" if mode == "ascii" else "8 with transmission_mode RTU"
-            self.desk.problem(self.input.at("data_bits"), f"found {bits}, allowed: {allowed}")
+            self.input.problem("data_bits", f"found {bits}, allowed: {allowed}")
         if (rts := self._rs485()) is not None:
             options["rs485"] = rts
         if re.fullmatch(r"COM[0-9]+|\\\\\.\\.+", device):
@@ -255,14 +252,13 @@ class Input:
         during, after = table.flag("rts_high_during_send"), table.flag("rts_high_after_send")
         for key in ("delay_rts_before_send", "delay_rts_after_send"):
             if seconds(table, key):
-                self.desk.left_out(table.at(key), "RTS switches without a delay")
+                table.left_out(key, "RTS switches without a delay")
         if table.flag("rx_during_tx"):
-            message = "an echo is detected; see echo of tolerance"
-            self.desk.left_out(table.at("rx_during_tx"), message)
+            table.left_out("rx_during_tx", "an echo is detected; see echo of tolerance")
         table.close()
         if bool(during) == bool(after):
             message = "RTS is the same during and after sending, so it switches nothing"
-            self.desk.left_out(table.path, message)
+            table.desk.left_out(table.path, message)
             return None
         return "rts" if during else "rts-low"
 
