@@ -151,8 +151,7 @@ def describe(
     with interruptions() as signals:
         report = Report({"target": url}, signals)
         most = None if everything else MAX_LINES
-        plan = _Plan(settings, times, every, output, force, most)
-        run = _Run(url, asked, plan, report)
+        run = _Run(url, asked, settings, times, every, output, force, most, report)
         with device.connect(url, asked[0], timeout) as client:
             why = run.carry_out(client, is_line=is_line)
         run.end(why)
@@ -160,10 +159,12 @@ def describe(
         fail(f"{url}: {why}", is_printed=as_json)
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """What to do with each unit id."""
+@dataclass
+class _Run:
+    """The search of a device, and its findings so far."""
 
+    url: str
+    asked: Sequence[int]
     settings: Settings
     times: int
     every: float
@@ -172,16 +173,9 @@ class _Plan:
     """Whether a file may be replaced."""
     most: int | None
     """The most lines of tags in the text."""
+    report: Report
 
-
-class _Run:
-    """The search of a device, and its findings so far."""
-
-    def __init__(self, url: str, asked: Sequence[int], plan: _Plan, report: Report) -> None:
-        self._url = url
-        self._asked = asked
-        self._plan = plan
-        self._report = report
+    def __post_init__(self) -> None:
         self._seen: list[Unit] = []
         self._ignores = False
         self._found: list[Description] = []
@@ -208,14 +202,13 @@ class _Run:
     def carry_out(self, client: SyncClient, *, is_line: bool) -> Ended | None:
         """Asks unit ids, and describes those that answer. Returns why it ended early, or `None`."""
         why = self._attempt(lambda: self._ask(client, is_line=is_line))
-        lines = units_lines(self._url, self._asked, self._seen, self._ignores)
-        self._report.text(*lines)
+        self.report.text(*units_lines(self.url, self.asked, self._seen, self._ignores))
         if why is not None:
             return why
         for each in self._to_describe:
             client.unit = each.unit
-            found = Description(each.unit, planned(self._plan.settings), each.identity)
-            unit = _UnitReport(found, self._report)
+            found = Description(each.unit, planned(self.settings), each.identity)
+            unit = _UnitReport(found, self.report)
             self._found.append(unit.found)
             why = self._conclude(unit, self._attempt(partial(self._describe, unit, client)))
             if why is not None:
@@ -231,11 +224,11 @@ class _Run:
         """Prints what is known when the search has ended."""
         left = [each.unit for each in self._to_describe[len(self._found) :]]
         if left:
-            self._report.text("", f"Incomplete. Not described: unit ids {number_ranges(left)}.")
-        self._report.end(
+            self.report.text("", f"Incomplete. Not described: unit ids {number_ranges(left)}.")
+        self.report.end(
             {
                 **ended_to_json(why),
-                **units_to_json(self._asked, self._seen, self._ignores),
+                **units_to_json(self.asked, self._seen, self._ignores),
                 "not_described": left,
                 "files": self._files,
                 "units": [unit_to_json(each) for each in self._found],
@@ -243,19 +236,19 @@ class _Run:
         )
 
     def _attempt(self, work: Callable[[], None]) -> Ended | None:
-        return self._report.attempt(work, self._url, lambda: self._answering)
+        return self.report.attempt(work, self.url, lambda: self._answering)
 
     def _ask(self, client: SyncClient, *, is_line: bool) -> None:
-        asked, delay = self._asked, self._plan.settings.delay
-        with self._report.progress("Asking", len(asked), lambda: ""):
+        asked, delay = self.asked, self.settings.delay
+        with self.report.progress("Asking", len(asked), lambda: ""):
             for unit in device_search.units(client, asked, delay=delay):
-                with self._report.held():
+                with self.report.held():
                     self._seen.append(unit)
-                    self._report.advance(len(self._seen))
+                    self.report.advance(len(self._seen))
                     if unit.answers:
-                        self._report.text(f"Unit {unit.unit} answers.")
+                        self.report.text(f"Unit {unit.unit} answers.")
                         about = dict(unit.identity.objects)
-                        self._report.entry({"unit": unit.unit, "identification": about})
+                        self.report.entry({"unit": unit.unit, "identification": about})
         if len(asked) == len(self._seen):
             self._ignores = device_search.ignores_unit(
                 client, self._seen, is_line=is_line, delay=delay
@@ -265,13 +258,13 @@ class _Run:
         survey = unit.found.survey
         if sys.stderr.isatty():
             click.echo(f"Unit {unit.found.unit}: {announced(survey)}", err=True)
-        with self._report.progress("Mapping", survey.total, lambda: f"unit {unit.found.unit}"):
+        with self.report.progress("Mapping", survey.total, lambda: f"unit {unit.found.unit}"):
             description.describe(
                 unit.found,
                 client,
-                reads=self._plan.times,
-                every=self._plan.every,
-                delay=self._plan.settings.delay,
+                reads=self.times,
+                every=self.every,
+                delay=self.settings.delay,
                 progress=lambda _: unit.update(),
             )
 
@@ -289,8 +282,8 @@ class _Run:
         else:
             why = self._attempt(infer) or why
         written = self._write(unit.found)
-        self._report.text(*described_lines(unit.found, self._plan.most))
-        self._report.text(*written)
+        self.report.text(*described_lines(unit.found, self.most))
+        self.report.text(*written)
         return why
 
     def _write(self, found: Description) -> list[str]:
@@ -298,14 +291,14 @@ class _Run:
 
         Returns what to print of it: the file, or the tag list if it can't be written.
         """
-        path = self._plan.output
+        path = self.output
         if path is None or not found.tags:
             return []
         tags = [each.tag for each in found.tags]
         text = tags_as_csv(tags) if path.suffix.lower() == ".csv" else tags_as_yaml(tags)
         if len(self._to_describe) > 1:
             path = path.with_stem(f"{path.stem}-unit{found.unit}")
-            if path.exists() and not self._plan.replaces:
+            if path.exists() and not self.replaces:
                 self._fail_to_write(f"{path} exists; --force replaces it")
                 return ["", text]
         data = text.encode()
