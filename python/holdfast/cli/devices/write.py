@@ -110,23 +110,22 @@ def write(
     usage.
     """
     click.get_current_context().with_resource(sigterm_as_ctrl_c())
+    in_no_area = device_items.is_named(words)
+    is_changed = kind is not None or order != "ABCD" or encoding is not None or split or modicon
+    if is_changed and (files.given or in_no_area):
+        what = "tags" if files.given else words[0]
+        raise click.UsageError(
+            f"--type, --order, --encoding, --split and --modicon can't be used with {what}."
+        )
     if files.given:
         from holdfast.cli.tags import write as tagged_write
 
-        if kind is not None or order != "ABCD" or encoding is not None or split or modicon:
-            raise click.UsageError(
-                "--type, --order, --encoding, --split and --modicon can't be used with tags."
-            )
         of = files.device(url, unit, timeout)
         tagged_write.write_tags(of, words, verify=verify, dry_run=dry_run, as_json=as_json)
         return
     if not words:
         raise click.UsageError("Missing argument 'ITEM VALUE...'.")
-    if device_items.is_named(words):
-        if kind is not None or order != "ABCD" or encoding is not None or split or modicon:
-            raise click.UsageError(
-                f"--type, --order, --encoding, --split and --modicon can't be used with {words[0]}."
-            )
+    if in_no_area:
         _carry_out(
             _file_job(words), url, unit, timeout, verify=verify, dry_run=dry_run, as_json=as_json
         )
