@@ -21,6 +21,7 @@ from holdfast.cli.options.option import (
 from holdfast.cli.terminal_text import print_json
 from holdfast.config import ConfigError
 from holdfast.config.initial_values import parse, read
+from holdfast.runtime.text import extent
 
 if TYPE_CHECKING:
     from holdfast.cli.appliance.memory_file import KeptArea
@@ -143,7 +144,7 @@ def _places(found: dict[str, dict[Area, KeptArea]]) -> dict[str, dict[Area, dict
 def _show(name: str, areas: dict[Area, KeptArea]) -> None:
     for area, kept in areas.items():
         set_ = sum(map(bool, kept.values))
-        click.echo(f"{name}: {area} {kept.start} to {kept.addresses.stop - 1}, {set_:,} not 0")
+        click.echo(f"{name}: {area} {extent(kept.addresses)}, {set_:,} not 0")
 
 
 def _chosen(found: dict[str, dict[Area, KeptArea]], name: str | None, file: Path) -> str:

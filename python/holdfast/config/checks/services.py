@@ -18,7 +18,7 @@ from holdfast.config.models.base import INVALID, InvalidValue
 from holdfast.config.models.listeners import ModbusTcpListener, UnitMemoryConfig
 from holdfast.config.models.services import HTTP_SERVICES
 from holdfast.config.text.messages import show
-from holdfast.runtime.text import either, listing, suggestion
+from holdfast.runtime.text import either, extent, listing, suggestion
 from holdfast.tags import Tag, TagError
 from holdfast.tags.scale import RegisterScale
 from holdfast.values.orders import DEFAULT_ORDER
@@ -273,5 +273,4 @@ def _check_place(scope: Scope, path: KeyPath, entry: MappingConfig, tag: Tag) ->
     addresses = areas[tag.area]
     if addresses is not None and not (tag.address in addresses and tag.end - 1 in addresses):
         found = f"found {tag.area} {tag.address} to {tag.end - 1}"
-        allowed = f"{addresses.start} to {addresses.stop - 1}"
-        report.add(at, f"{found}, allowed: addresses {allowed}")
+        report.add(at, f"{found}, allowed: addresses {extent(addresses)}")

@@ -6,7 +6,7 @@ import re
 from typing import TYPE_CHECKING, Any
 
 from holdfast.protocol import ADDRESSES
-from holdfast.runtime.text import listing
+from holdfast.runtime.text import extent, listing
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
@@ -77,6 +77,5 @@ def check_gate(
     there = addresses(areas[area])
     if address in there:
         return True
-    allowed = f"allowed in {area} of {memory}: {there.start} to {there.stop - 1}"
-    desk.problem(path, f"found {address}, {allowed}")
+    desk.problem(path, f"found {address}, allowed in {area} of {memory}: {extent(there)}")
     return False
