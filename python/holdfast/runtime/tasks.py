@@ -1,20 +1,38 @@
-"""Tasks of asyncio: their end, waiting with a limit, and the heartbeat of their event loop."""
+"""Tasks of asyncio: their beginning and end, waiting with a limit, the heartbeat of their loop."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from holdfast.runtime.heartbeat import PERIOD_S
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Iterable
+    from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterable
 
     from holdfast.runtime.heartbeat import Heartbeat
 
 CANCEL_INTERVAL_S = 2.0
 """Seconds after which a task that has not ended is cancelled again."""
+
+
+Result = TypeVar("Result")
+
+
+def begin(work: Coroutine[Any, Any, Result], among: set[asyncio.Task[Result]]) -> None:
+    """Runs work as a task, which is `among` others until it ends: asyncio keeps no task alive."""
+    task = asyncio.create_task(work)
+    among.add(task)
+    task.add_done_callback(among.discard)
+
+
+def call_soon(
+    loop: asyncio.AbstractEventLoop, call: Callable[..., object], *arguments: object
+) -> None:
+    """Calls a function in an event loop, unless that is closed already. Thread-safe."""
+    with contextlib.suppress(RuntimeError):
+        loop.call_soon_threadsafe(call, *arguments)
 
 
 def check() -> None:
@@ -41,6 +59,17 @@ async def end(tasks: Iterable[asyncio.Task[Any]]) -> None:
         for task in done:
             if not task.cancelled():
                 task.exception()  # Marks it retrieved.
+
+
+async def until_first(works: Iterable[Coroutine[Any, Any, object]]) -> None:
+    """Runs all until one has ended, and ends the others. Raises its error, if it has one."""
+    running = [asyncio.create_task(work) for work in works]
+    try:
+        done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        await end(running)
 
 
 async def within(seconds: float | None, step: Awaitable[object]) -> None:

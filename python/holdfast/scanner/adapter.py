@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import threading
+from functools import partial
 from typing import TYPE_CHECKING
 
 from holdfast.net import event_loop
@@ -53,12 +53,7 @@ class ScannerAdapter:
 
     async def _serve(self, stop: Stop) -> None:
         loop = asyncio.get_running_loop()
-
-        def end() -> None:
-            with contextlib.suppress(RuntimeError):  # The loop is already closed.
-                loop.call_soon_threadsafe(self._scanner.end)
-
-        stop.then(end)
+        stop.then(partial(tasks.call_soon, loop, self._scanner.end))
         async with tasks.beating(self.heartbeat):
             try:
                 await self._scanner.run()

@@ -88,9 +88,7 @@ class Responder:
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:
         """Runs a task that `end` ends."""
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        tasks.begin(work, self._tasks)
 
     async def finish(self, within_s: float) -> None:
         """Waits until all tasks have ended, or for this time."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,6 +15,7 @@ from holdfast.net.http.openapi import html_answer, json_answer
 from holdfast.net.http.operations import Operation
 from holdfast.net.http.refusals import UNREAD, headers_with
 from holdfast.net.http.requests import JSON, SAFE, BadRequest, Response, response, shown
+from holdfast.runtime import tasks
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
@@ -90,8 +90,7 @@ class Application:
     def call_soon(self, function: Callable[[], object]) -> None:
         """Calls a function in the thread of the application. Thread-safe."""
         if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # The loop is already closed.
-                self._loop.call_soon_threadsafe(function)
+            tasks.call_soon(self._loop, function)
 
     # What a subclass has.
 

@@ -144,17 +144,12 @@ class Host:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._log_loop_error)
         stopped = asyncio.Event()
-
-        def end() -> None:
-            with contextlib.suppress(RuntimeError):  # The loop of this run is already closed.
-                loop.call_soon_threadsafe(stopped.set)
-
-        stop.then(end)
+        stop.then(partial(tasks.call_soon, loop, stopped.set))
         server = self._server = self._new_server()
         try:
             wakes = socket.socket(fileno=server.detach())
             transport, _ = await loop.create_connection(
-                lambda: _WakeSocket(lambda: self._take(server, loop)), sock=wakes
+                lambda: _WakeSocket(lambda: self._take(server)), sock=wakes
             )
             server.start()
             while not stopped.is_set():
@@ -210,11 +205,11 @@ class Host:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
 
-    def _take(self, server: HttpServer, loop: asyncio.AbstractEventLoop) -> None:
+    def _take(self, server: HttpServer) -> None:
         """Takes a batch of requests, and what has happened to others."""
         batches, events = server.take(REQUESTS_PER_BATCH)
         for batch in batches:
-            second = [step for each in batch if (step := self._begin(each, loop)) is not None]
+            second = [step for each in batch if (step := self._begin(each)) is not None]
             for step in second:
                 step()
             server.flush()
@@ -225,12 +220,10 @@ class Host:
         if not batches and not events:
             self._log_events(server)
 
-    def _begin(
-        self, item: ParsedWrites | tuple[Any, ...], loop: asyncio.AbstractEventLoop
-    ) -> Callable[[], None] | None:
+    def _begin(self, item: ParsedWrites | tuple[Any, ...]) -> Callable[[], None] | None:
         """Calls the handler. Returns its second step, if it has one."""
         if isinstance(item, ParsedWrites):
-            return self._begin_parsed(item, loop)
+            return self._begin_parsed(item)
         request = _HostRequest(*item)
         try:
             outcome = self.handler(request)
@@ -242,9 +235,7 @@ class Host:
         if callable(outcome):
             return partial(self._second_step, request, outcome)
         self._open[request.exchange.number] = request
-        task = loop.create_task(self._answer(request, outcome))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        tasks.begin(self._answer(request, outcome), self._tasks)
         return None
 
     def _second_step(self, request: _HostRequest, step: SecondStep) -> None:
@@ -254,9 +245,7 @@ class Host:
             answer = self._failed(request, error)
         self._respond(request, answer)
 
-    def _begin_parsed(
-        self, writes: ParsedWrites, loop: asyncio.AbstractEventLoop
-    ) -> Callable[[], None]:
+    def _begin_parsed(self, writes: ParsedWrites) -> Callable[[], None]:
         """Calls the handler of writes that the core has parsed. It answers those it carries out."""
         carry_out: Callable[[], object] | None = None
         with self._logged():
@@ -267,7 +256,7 @@ class Host:
                 if carry_out is not None:
                     carry_out()
             for each in writes.requests():
-                if (step := self._begin(each, loop)) is not None:
+                if (step := self._begin(each)) is not None:
                     step()
 
         return second_step

@@ -513,6 +513,4 @@ class Leases:
             self._watcher.lost(key, reason)
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        tasks.begin(work, self._tasks)

@@ -7,7 +7,6 @@ moves fences: if it hangs or fails, they close by themselves, and nothing is sen
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import threading
 from collections.abc import Callable, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -54,7 +53,7 @@ class LeaseThread:
         self._stopping = asyncio.Event()
         self._ending = 0.0
         self._thread: threading.Thread | None = None
-        self._tasks: set[asyncio.Task[Any]] = set()
+        self._tasks: set[asyncio.Task[bool]] = set()
 
     def start(self) -> None:
         """Begins to hold what is wanted."""
@@ -100,8 +99,7 @@ class LeaseThread:
 
     def _soon(self, call: Callable[..., object], *arguments: object) -> None:
         assert self._loop is not None, "it was started"
-        with contextlib.suppress(RuntimeError):  # The thread has ended.
-            self._loop.call_soon_threadsafe(call, *arguments)
+        tasks.call_soon(self._loop, call, *arguments)
 
     async def _do(
         self, work: Callable[..., Coroutine[Any, Any, object]], *arguments: object
@@ -116,9 +114,7 @@ class LeaseThread:
         await asyncio.wrap_future(future)
 
     def _begin_to_give_back(self, key: str, limit: float) -> None:
-        task = asyncio.create_task(self._leases.give_back(key, limit))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        tasks.begin(self._leases.give_back(key, limit), self._tasks)
 
     def _run(self) -> None:
         loop = self._loop
@@ -191,5 +187,4 @@ class Relay:
 
     def _soon(self, call: Callable[..., object], *arguments: object) -> None:
         assert self._loop is not None, "it is attached"
-        with contextlib.suppress(RuntimeError):  # The other loop has ended.
-            self._loop.call_soon_threadsafe(call, *arguments)
+        tasks.call_soon(self._loop, call, *arguments)

@@ -112,7 +112,6 @@ class FleetMember(Placement):
         Sets `ready` when it knows the desired state.
         """
         self._device_host, self._subscription_host = devices, subscriptions
-        running: list[asyncio.Task[None]] = []
         self.fleet.start()
         try:
             async with tasks.beating(self.fleet.heartbeat):
@@ -123,12 +122,8 @@ class FleetMember(Placement):
                     self._adopt_changes(),
                     self._adopt_refused(),
                 )
-                running += [asyncio.create_task(work) for work in works]
-                done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
-                for task in done:
-                    task.result()
+                await tasks.until_first(works)
         finally:
-            await tasks.end(running)
             await self.fleet.stop()
 
     async def _open(self, ready: asyncio.Event) -> None:
