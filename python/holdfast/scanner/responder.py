@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, TypeAlias
 import msgspec
 
 from holdfast.events import log_lines
-from holdfast.net.nats import batch
 from holdfast.runtime import tasks
 from holdfast.scanner.errors import STOPPING, NotConfirmed, Refused
 from holdfast.scanner.messages.types import Answer, BrowseAnswer
@@ -51,7 +50,7 @@ class Responder:
             answer = await self._answer(kind, handle, message)
             if message.reply:
                 payload = answer if isinstance(answer, bytes) else msgspec.json.encode(answer)
-                await self._outbox.answer(message.reply, batch.text(message.reply, payload))
+                await self._outbox.answer(message.reply, payload)
 
         async def begin(message: Msg) -> None:
             self.begin(carry_out(message))

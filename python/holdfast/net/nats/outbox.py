@@ -77,9 +77,9 @@ class Outbox:
             self._queue_bytes += sum(map(len, texts))
         self._has_messages.set()
 
-    async def answer(self, subject: str, text: bytes) -> None:
+    async def answer(self, subject: str, payload: bytes) -> None:
         """Sends a message that a caller waits for, before all queued messages."""
-        client = self._client
+        client, text = self._client, batch.text(subject, payload)
         if client is not None and client.is_connected:
             await batch.send(client, text, 1)
         else:

@@ -9,7 +9,6 @@ import msgspec
 
 from holdfast import _core
 from holdfast.events import log_lines
-from holdfast.net.nats import batch
 from holdfast.net.nats.connection import Broker
 from holdfast.net.nats.outbox import Outbox
 from holdfast.runtime.malformed_json import MALFORMED_JSON
@@ -137,7 +136,7 @@ class FleetPlacement(FleetMember):
             """Hands all devices over to the other nodes, and ends."""
             log_lines.write(logging.INFO, "shutdown_asked")
             if message.reply:
-                answer = batch.text(message.reply, msgspec.json.encode(Answer(success=True)))
+                answer = msgspec.json.encode(Answer(success=True))
                 await self._outbox.answer(message.reply, answer)
             end()
 

@@ -13,7 +13,7 @@ from holdfast.scanner.publish.publisher import Publisher
 from holdfast.scanner.subscriptions.groups import grouped
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterable
 
     from holdfast.net.nats.outbox import Outbox
     from holdfast.scanner.dialects import Dialect
@@ -87,19 +87,23 @@ class Publishers:
         # Stored as well as published: a program that starts later reads the last state.
         device.status = msgspec.json.encode(status)
         self._placement.state_changed(device.id)
-        for name in device.subjects:
-            subject = f"{self._prefix}.status.{name}"
-            text = batch.text(subject, device.status)
-            if (lease := self._placement.lease(device)) is not None:
-                text = batch.leased(text, lease)
-            self._outbox.put([(subject, text)], of=device.id)
+        lease = self._placement.lease(device)
+        self._put_status(device.id, device.subjects, device.status, lease)
 
     def publish_given_up(self, device_id: str, reason: str) -> None:
         """Publishes that a device is offline that is not known any more."""
         status = Status(device_id, "offline", 0, int(time.time() * 1000), reason)
-        for name in self._dialect.device_names(device_id):
+        names = self._dialect.device_names(device_id)
+        self._put_status(device_id, names, msgspec.json.encode(status))
+
+    def _put_status(
+        self, device_id: str, names: Iterable[str], status: bytes, lease: int | None = None
+    ) -> None:
+        for name in names:
             subject = f"{self._prefix}.status.{name}"
-            text = batch.text(subject, msgspec.json.encode(status))
+            text = batch.text(subject, status)
+            if lease is not None:
+                text = batch.leased(text, lease)
             self._outbox.put([(subject, text)], of=device_id)
 
     def _begin(self, device: ScannedDevice) -> Publisher:
