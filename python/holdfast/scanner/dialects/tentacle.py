@@ -23,6 +23,14 @@ BYTE_ORDERS = {("float64", "CDAB"): "CDABGHEF"}
 """The four letters mislead: tentacle-modbus swaps the words of each half."""
 
 
+def utf8_text(data: bytes) -> str:
+    """Returns the payload of a command as text. Raises `Refused`."""
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        raise Refused("the value is not UTF-8 text") from None
+
+
 class Tentacle:
     """What programs of the first generation send and expect."""
 
@@ -86,7 +94,4 @@ class Tentacle:
 
     def command_text(self, data: bytes) -> str:
         """Returns the payload, which is the value as text. Raises `Refused`."""
-        try:
-            return data.decode()
-        except UnicodeDecodeError:
-            raise Refused("the value is not UTF-8 text") from None
+        return utf8_text(data)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.scanner.dialects.tentacle import utf8_text
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.subject_parts import tentacle_next_name
 
@@ -66,21 +67,6 @@ def _tag(found: Any) -> Any:
     return found | {key: default for key, default in TAG_DEFAULTS.items() if not found.get(key)}
 
 
-def _command_text(data: bytes) -> str:
-    try:
-        value = msgspec.json.decode(data)
-        raw = bytes(msgspec.json.decode(data, type=_Command).value) if type(value) is dict else data
-        value = msgspec.json.decode(raw)
-    except msgspec.ValidationError as error:
-        raise Refused(f"{error}, {COMMAND_FORM}") from None
-    except MALFORMED_JSON as error:
-        raise Refused(f"not JSON: {error}; {COMMAND_FORM}") from None
-    if value is None or type(value) is dict:
-        found = "null" if value is None else "an object"
-        raise Refused(f"the value is {found}, allowed: numbers, booleans, texts and arrays")
-    return value if type(value) is str else raw.decode()
-
-
 class TentacleNext:
     """What programs of tentacle-next send and expect. `Tentacle` describes each member."""
 
@@ -128,8 +114,17 @@ class TentacleNext:
 
     def command_text(self, data: bytes) -> str:
         """Returns the value of a JSON command as text. Raises `Refused`."""
+        utf8_text(data)  # So that this is what is said of other bytes.
         try:
-            data.decode()
-        except UnicodeDecodeError:
-            raise Refused("the value is not UTF-8 text") from None
-        return _command_text(data)
+            value = msgspec.json.decode(data)
+            is_object = type(value) is dict
+            raw = bytes(msgspec.json.decode(data, type=_Command).value) if is_object else data
+            value = msgspec.json.decode(raw)
+        except msgspec.ValidationError as error:
+            raise Refused(f"{error}, {COMMAND_FORM}") from None
+        except MALFORMED_JSON as error:
+            raise Refused(f"not JSON: {error}; {COMMAND_FORM}") from None
+        if value is None or type(value) is dict:
+            found = "null" if value is None else "an object"
+            raise Refused(f"the value is {found}, allowed: numbers, booleans, texts and arrays")
+        return value if type(value) is str else raw.decode()
