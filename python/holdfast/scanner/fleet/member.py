@@ -303,10 +303,9 @@ class FleetMember(Placement):
 
     def _requests(self, device_id: str) -> Iterator[bytes]:
         """Yields the requests that make the subscriptions of a device."""
-        device = self._registry.devices.get(device_id)
-        for subscriber in () if device is None else device.subscribers:
-            assert device is not None, "it has subscribers"
-            yield from stored_requests(device, subscriber)
+        if (device := self._registry.devices.get(device_id)) is not None:
+            for subscriber in device.subscribers:
+                yield from stored_requests(device, subscriber)
 
     def _subscribers_with_ttl(self, device_id: str) -> list[str]:
         device = self._registry.devices.get(device_id)

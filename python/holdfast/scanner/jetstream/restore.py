@@ -48,7 +48,6 @@ class StoredSubscriptions(Placement):
     def __init__(self, prefix: str, registry: Registry) -> None:
         self._prefix = prefix
         self._registry = registry
-        self._host: SubscriptionHost | None = None
         self._pending: dict[SubscriptionKey, list[SubscribeRequest]] = {}
         """Stored requests that are not carried out yet."""
         self._logged: set[SubscriptionKey] = set()
@@ -72,7 +71,7 @@ class StoredSubscriptions(Placement):
         self._device_host, self._host = devices, host
         async with asyncio.TaskGroup() as running:
             running.create_task(self._store.run())
-            running.create_task(self._restore(host, ready))
+            running.create_task(self._restore(ready))
 
     async def close(self) -> None:
         """Removes the states of devices, which would be out of date. Then stores nothing."""
@@ -108,7 +107,6 @@ class StoredSubscriptions(Placement):
 
     def _entries(self, owner: SubscriptionKey) -> Mapping[str, bytes]:
         """Returns the entries of an owner: nothing, if it is gone."""
-        assert self._host is not None, "the store runs"
         if self._host.is_entry(owner.device, owner.subscriber):
             return {}
         if owner in self._pending:
@@ -161,11 +159,11 @@ class StoredSubscriptions(Placement):
         device = self._registry.devices.get(owner.device)
         return device is not None and owner.subscriber in device.subscribers
 
-    async def _restore(self, host: SubscriptionHost, ready: asyncio.Event) -> None:
+    async def _restore(self, ready: asyncio.Event) -> None:
         """Carries out pending requests, until it is cancelled."""
         await self._store.tried.wait()
         while True:
-            work = asyncio.create_task(self._restore_all(host))
+            work = asyncio.create_task(self._restore_all())
             try:
                 await asyncio.wait([work], timeout=None if ready.is_set() else MAX_RESTORE_WAIT_S)
                 ready.set()
@@ -178,19 +176,19 @@ class StoredSubscriptions(Placement):
                 self._found_pending.clear()
                 await self._found_pending.wait()
 
-    async def _restore_all(self, host: SubscriptionHost) -> None:
+    async def _restore_all(self) -> None:
         devices: dict[str, list[SubscriptionKey]] = {}
         for owner in self._pending:
             devices.setdefault(owner.device, []).append(owner)
-        await asyncio.gather(*(self._restore_device(host, each) for each in devices.values()))
+        await asyncio.gather(*map(self._restore_device, devices.values()))
 
-    async def _restore_device(self, host: SubscriptionHost, owners: list[SubscriptionKey]) -> None:
+    async def _restore_device(self, owners: list[SubscriptionKey]) -> None:
         pending = [(owner, self._pending.get(owner, [])) for owner in owners]
         for owner, found in sorted(pending, key=lambda each: is_last(each[1])):
             if not found or self._pending.get(owner) is not found:
                 continue  # A caller has changed it.
             try:
-                await host.restore(joined(found))
+                await self._host.restore(joined(found))
             except Refused as refused:
                 if owner not in self._logged:
                     self._logged.add(owner)

@@ -108,12 +108,9 @@ class Publisher:
         self._groups = []
         for group in groups:
             scheduled = before.get((group.change, group.rate))
-            is_same = same and scheduled is not None and scheduled.group == group
-            self._groups.append(
-                scheduled
-                if is_same and scheduled is not None
-                else _ScheduledGroup(group, scheduled)
-            )
+            if scheduled is None or not same or scheduled.group != group:
+                scheduled = _ScheduledGroup(group, scheduled)
+            self._groups.append(scheduled)
         publish_now = {
             id for scheduled in self._groups for id in scheduled.publish_now(self._fresh)
         }
@@ -270,9 +267,7 @@ class Publisher:
         after = rest.removesuffix(b"0}")
         subject = self._dialect.data_subject(self._prefix, self._device, tag.id).encode()
         header = self._header
-        head = b"PUB %b " % subject
-        if header:
-            head = b"HPUB %b %d " % (subject, len(header))
+        head = b"HPUB %b %d " % (subject, len(header)) if header else b"PUB %b " % subject
         length = len(header) + len(before) + len(after) + len(b"}")
         return head, length, b"\r\n" + header + before, after
 

@@ -18,7 +18,6 @@ from holdfast.net.hosts import HOST_FORM, is_host
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS, usual_port
 from holdfast.runtime.text import quote
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.messages.decoding import Adjustments
 from holdfast.scanner.messages.types import TagRequest
 from holdfast.scanner.subscriptions.device import NO_OPTIONS, Source, TagOptions
 from holdfast.scanner.subscriptions.plan import Plan
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
 
     from holdfast.client.url import Target
     from holdfast.config.values.scanner_settings import Publish
+    from holdfast.scanner.messages.decoding import Adjustments
     from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.subscriptions.request_rules import Rules
     from holdfast.tags.base import Marker
@@ -66,7 +66,7 @@ class Subscription:
 def subscription_of(
     request: SubscribeRequest,
     rules: Rules,
-    adjustments: Adjustments | None = None,
+    adjustments: Adjustments,
     *,
     expands: bool = True,
 ) -> Subscription:
@@ -74,9 +74,10 @@ def subscription_of(
 
     Unless it `expands` the profile of the request, only the tags of the request are subscribed to.
     """
-    adjustments = Adjustments() if adjustments is None else adjustments
     defaults = rules.defaults
-    _check_id(request.device_id)
+    if not request.device_id.isprintable():  # It becomes a part of subjects.
+        found = f"deviceId is {request.device_id!r}"
+        raise Refused(f"{found}, allowed: printable characters and blanks")
     publish = request.publish or defaults.publish
     if request.deadband and publish != "change":
         raise Refused('deadband requires "publish": "change"')
@@ -109,12 +110,6 @@ def subscription_of(
         request.ttl,
         request.profile,
     )
-
-
-def _check_id(id: str) -> None:
-    """Checks a device id, which becomes a part of subjects. Raises `Refused`."""
-    if not id.isprintable():
-        raise Refused(f"deviceId is {id!r}, allowed: printable characters and blanks")
 
 
 def _target(request: SubscribeRequest) -> Target:
