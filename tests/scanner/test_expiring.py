@@ -44,7 +44,7 @@ KEY = SubscriptionKey("plc1", "hmi")
 
 
 def test_a_subscription_is_due_when_its_time_is_over(ttls: SubscriptionTtls, clock: Clock) -> None:
-    ttls.renew("plc1", "hmi", 10)
+    ttls.renew(KEY, 10)
     clock.now += 9.9
     assert not ttls.is_due(KEY)
     clock.now += 0.1
@@ -53,22 +53,22 @@ def test_a_subscription_is_due_when_its_time_is_over(ttls: SubscriptionTtls, clo
 
 
 def test_a_repeated_request_starts_the_time_again(ttls: SubscriptionTtls, clock: Clock) -> None:
-    ttls.renew("plc1", "hmi", 10)
+    ttls.renew(KEY, 10)
     clock.now += 9
-    ttls.renew("plc1", "hmi", 10)
+    ttls.renew(KEY, 10)
     clock.now += 9
     assert not ttls.is_due(KEY)
 
 
 def test_a_request_without_a_time_ends_the_time(ttls: SubscriptionTtls, clock: Clock) -> None:
-    ttls.renew("plc1", "hmi", 10)
-    ttls.renew("plc1", "hmi", None)
+    ttls.renew(KEY, 10)
+    ttls.renew(KEY, None)
     clock.now += 1000
     assert not ttls.is_due(KEY)
 
 
 def test_the_time_does_not_run_without_nats(ttls: SubscriptionTtls, clock: Clock) -> None:
-    ttls.renew("plc1", "hmi", 10)
+    ttls.renew(KEY, 10)
     ttls.connected(False)
     clock.now += 1000
     assert not ttls.is_due(KEY)
@@ -84,14 +84,14 @@ def test_each_due_subscription_ends_once(ttls: SubscriptionTtls, clock: Clock) -
 
     async def end(key: SubscriptionKey) -> None:
         ended.append(key)
-        ttls.renew(key.device, str(key.subscriber), None)
+        ttls.renew(key, None)
 
     async def run() -> None:
         running = asyncio.create_task(ttls.run(end))
-        ttls.renew("plc1", "hmi", 10)
-        ttls.renew("plc1", "trend", 20)
+        ttls.renew(KEY, 10)
+        ttls.renew(SubscriptionKey("plc1", "trend"), 20)
         clock.now += 10
-        ttls.renew("plc2", "hmi", 5)
+        ttls.renew(SubscriptionKey("plc2", "hmi"), 5)
         for _ in range(100):
             await asyncio.sleep(0)
         running.cancel()

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     )
     from holdfast.scanner.responder import Handle
     from holdfast.scanner.subscriptions.device import ScannedDevice
+    from holdfast.scanner.subscriptions.key import SubscriptionKey
     from holdfast.scanner.subscriptions.tag import Tag
 
 Changed = TypeVar("Changed")
@@ -57,7 +58,7 @@ class DeviceHost(Protocol):
 class SubscriptionHost(Protocol):
     """Carries out what is stored."""
 
-    def is_entry(self, device: str, subscriber: str | None) -> bool:
+    def is_entry(self, subscription: SubscriptionKey) -> bool:
         """Whether a subscription is from an entry of a bucket, which keeps it then."""
 
     async def restore(self, request: SubscribeRequest) -> None:
@@ -203,7 +204,7 @@ class Placement:
     def state_changed(self, device: str) -> None:
         """Notes that the state of a device has changed, or that the device is gone."""
 
-    async def settled(self, device: str, subscriber: str) -> None:
+    async def settled(self, subscription: SubscriptionKey) -> None:
         """Waits until a changed subscription is stored; not while JetStream fails."""
 
     async def write(

@@ -76,37 +76,20 @@ class RequestLog:
 
     def subscribed(self, subscription: Subscription) -> None:
         """Logs a subscription."""
-        log_lines.write(
-            logging.INFO,
-            "subscribed",
-            device=subscription.device,
-            subscriber=subscription.subscriber,
-            tags=len(subscription.tags),
-            scan_rate=subscription.rate,
-        )
+        tags, rate = len(subscription.tags), subscription.rate
+        subscription.key.log(logging.INFO, "subscribed", tags=tags, scan_rate=rate)
 
     def tags_not_restored(
         self, subscription: Subscription, tags: Iterable[str], reason: str
     ) -> None:
         """Logs the tags without which a stored subscription is carried out."""
-        log_lines.write(
-            logging.WARNING,
-            "tags_not_restored",
-            device=subscription.device,
-            subscriber=subscription.subscriber,
-            tags=clip(", ".join(tags), MAX_LOGGED_IDS),
-            reason=reason,
-        )
+        shown = clip(", ".join(tags), MAX_LOGGED_IDS)
+        subscription.key.log(logging.WARNING, "tags_not_restored", tags=shown, reason=reason)
 
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Logs the end of a subscription, or of some of its tags."""
-        log_lines.write(
-            logging.INFO,
-            "unsubscribed",
-            device=request.device_id,
-            subscriber=request.subscriber_id,
-            tags="all" if request.ids is None else len(request.ids),
-        )
+        tags = "all" if request.ids is None else len(request.ids)
+        SubscriptionKey.of(request).log(logging.INFO, "unsubscribed", tags=tags)
 
 
 @dataclass(eq=False)
@@ -132,7 +115,7 @@ class Requests:
             request, adjustments = self._decoded(message.data, SubscribeRequest, normalize)
             subscription = subscription_of(request, self._rules, adjustments)
             # The program that owns the entry would overwrite this request at its next change.
-            self._buckets.check_not_entry(subscription.device, subscription.subscriber)
+            self._buckets.check_not_entry(subscription.key)
         async with self._devices.lock(subscription.device):
             add = partial(self._devices.add, subscription)
             new = await self._placement.store(subscription.device, add, subscription.subscriber)
@@ -140,9 +123,9 @@ class Requests:
                 self._devices.keep_only(
                     subscription.device, subscription.subscriber, subscription.tags
                 )
-        self.former.pop(SubscriptionKey(subscription.device, subscription.subscriber), None)
+        self.former.pop(subscription.key, None)
         # Outside the lock: storing can take seconds, and other requests need not wait for it.
-        await self._placement.settled(subscription.device, subscription.subscriber)
+        await self._placement.settled(subscription.key)
         self._log.adjusted(subscription.subscriber, subscription.device, adjustments)
         self._log.byte_orders(subscription, adjustments, new)
         self._log.subscribed(subscription)
@@ -154,13 +137,14 @@ class Requests:
         async with self._responder.in_order(message):
             request, adjustments = self._decoded(message.data, UnsubscribeRequest)
             self._rules.dialect.check_unsubscribe(request)
-            self._buckets.check_not_entry(request.device_id, request.subscriber_id)
+            owner = SubscriptionKey.of(request)
+            self._buckets.check_not_entry(owner)
         async with self._devices.lock(request.device_id):
             await self._remove_stored(request)
-        former = self.former.pop(SubscriptionKey(request.device_id, request.subscriber_id), [])
+        former = self.former.pop(owner, [])
         if request.ids is not None and (left := without(former, set(request.ids))):
-            self.former[SubscriptionKey(request.device_id, request.subscriber_id)] = left
-        await self._placement.settled(request.device_id, request.subscriber_id)
+            self.former[owner] = left
+        await self._placement.settled(owner)
         self._log.adjusted(request.subscriber_id, request.device_id, adjustments)
         self._log.unsubscribed(request)
         return Answer(success=True)
@@ -192,7 +176,7 @@ class Requests:
             subscriber = None if device is None else device.subscribers.get(subscriber_id)
             if device is None or subscriber is None or not self._placement.is_own(device):
                 # The node that polls the device ends it. If it does not, this one looks again.
-                ttls.renew(device_id, subscriber_id, None if subscriber is None else subscriber.ttl)
+                ttls.renew(subscription, None if subscriber is None else subscriber.ttl)
                 return
 
             async def change() -> bool:
@@ -204,14 +188,14 @@ class Requests:
             try:
                 has_ended = await self._placement.store(device_id, change)
             except Refused:  # JetStream fails: the subscription must not stay for ever.
-                ttls.renew(device_id, subscriber_id, RETRY_EXPIRY_S)
+                ttls.renew(subscription, RETRY_EXPIRY_S)
                 return
         if has_ended:
-            log_lines.write(logging.INFO, "expired", device=device_id, subscriber=subscriber_id)
+            subscription.log(logging.INFO, "expired")
 
-    def is_entry(self, device: str, subscriber: str | None) -> bool:
+    def is_entry(self, subscription: SubscriptionKey) -> bool:
         """Whether a subscription is from an entry of a bucket."""
-        return self._buckets.key_of(device, subscriber) is not None
+        return self._buckets.key_of(subscription) is not None
 
     def check_entry(self, key: str, value: bytes) -> Subscription:
         """Returns the subscription of an entry. Raises `Refused`."""
@@ -227,7 +211,7 @@ class Requests:
         async with self._devices.lock(subscription.device):
             await self._devices.add(subscription)
             self._devices.keep_only(subscription.device, subscription.subscriber, subscription.tags)
-        self.former.pop(SubscriptionKey(subscription.device, subscription.subscriber), None)
+        self.former.pop(subscription.key, None)
         self._log.subscribed(subscription)
 
     async def end_entry(self, subscription: SubscriptionKey) -> None:
@@ -241,7 +225,7 @@ class Requests:
 
     async def restore(self, request: SubscribeRequest) -> None:
         """Carries out a stored request, unless an entry has replaced it. Raises `Refused`."""
-        if self.is_entry(request.device_id, request.subscriber_id):
+        if self.is_entry(SubscriptionKey.of(request)):
             return
         async with self._devices.lock(request.device_id):
             await self._add_stored(request, is_stored=True)
@@ -313,7 +297,7 @@ class Requests:
             if known is not None and (wanted == present or (wanted, present) == known.adopted):
                 # Adding it again would make the device be scanned, and its values be published.
                 if subscriber in renewed:
-                    self._devices.ttls.renew(device, subscriber, request.ttl)
+                    self._devices.ttls.renew(SubscriptionKey.of(request), request.ttl)
                 continue
             if known is not None:
                 known.profile = request.profile  # It may have ended at another node.

@@ -177,30 +177,28 @@ class Scanner:
             return  # A fleet has stored all of them.
         parts: dict[SubscriptionKey, list[SubscribeRequest]] = {}
         for request in former:
-            owner = SubscriptionKey(request.device_id, request.subscriber_id)
-            parts.setdefault(owner, []).append(request)
+            parts.setdefault(SubscriptionKey.of(request), []).append(request)
         former = map(joined, sorted(parts.values(), key=is_last))
         await asyncio.gather(*map(self._restore, former))
 
     async def _restore(self, request: SubscribeRequest) -> None:
-        about = {"device": request.device_id, "subscriber": request.subscriber_id}
+        owner = SubscriptionKey.of(request)
         try:
             await self._requests.restore(request)
         except Refused as refused:
-            log_lines.write(logging.WARNING, "not_restored", **about, reason=str(refused))
+            owner.log(logging.WARNING, "not_restored", reason=str(refused))
             self._devices.give_up(request.device_id, str(refused))
             if request.ttl is None:  # Else its subscriber repeats it.
-                owner = SubscriptionKey(request.device_id, request.subscriber_id)
                 self._requests.former.setdefault(owner, []).append(request)
         else:
-            log_lines.write(logging.INFO, "restored", **about, tags=len(request.tags))
+            owner.log(logging.INFO, "restored", tags=len(request.tags))
 
     def stored_requests(self) -> Iterator[SubscribeRequest]:
         """Yields requests that make the subscriptions, except those from entries of a bucket."""
         yield from self.former
         for device in self._registry.devices.values():
             for subscriber in device.subscribers:
-                if not self._requests.is_entry(device.id, subscriber):
+                if not self._requests.is_entry(SubscriptionKey(device.id, subscriber)):
                     yield from map(restored, requests(device, subscriber))
         # Last: a refused one must not displace one that is carried out.
         yield from chain.from_iterable(self._requests.former.values())

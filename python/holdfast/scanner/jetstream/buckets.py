@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from holdfast.scanner.jetstream.entry_subscriptions import RefusedEntry
     from holdfast.scanner.jetstream.key_watch import WatchTimes, Written
+    from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 BUCKET = "service_enabled"
 
@@ -100,11 +101,11 @@ class Buckets:
         """The refused entries of the bucket of subscriptions, by key."""
         return ()
 
-    def key_of(self, _device: str, _subscriber: str | None, /) -> str | None:
+    def key_of(self, _subscription: SubscriptionKey, /) -> str | None:
         """Returns the key of the entry that a subscription is from; `None` if it is from none."""
         return None
 
-    def check_not_entry(self, device: str, subscriber: str) -> None:
+    def check_not_entry(self, subscription: SubscriptionKey) -> None:
         """Raises `Refused` for a subscription that is from an entry."""
 
     def connected(self, client: Client | None) -> None:
@@ -135,18 +136,16 @@ class TentacleNextBuckets(Buckets):
         """The refused entries, by key."""
         return self._entries.refused
 
-    def key_of(self, device: str, subscriber: str | None, /) -> str | None:
+    def key_of(self, subscription: SubscriptionKey, /) -> str | None:
         """Returns the key of the entry that a subscription is from; `None` if it is from none."""
-        return self._entries.key_of(device, subscriber)
+        return self._entries.key_of(subscription)
 
-    def check_not_entry(self, device: str, subscriber: str) -> None:
+    def check_not_entry(self, subscription: SubscriptionKey) -> None:
         """Raises `Refused` for a subscription that is from an entry."""
-        key = self._entries.key_of(device, subscriber)
-        if key is not None:
-            raise Refused(
-                f"the subscription of {subscriber!r} to {device!r} is the entry {key!r} of the "
-                f"bucket {self._entries.bucket}: change that entry"
-            )
+        if (key := self.key_of(subscription)) is not None:
+            of = f"the subscription of {subscription.subscriber!r} to {subscription.device!r}"
+            at = f"the entry {key!r} of the bucket {self._entries.bucket}"
+            raise Refused(f"{of} is {at}: change that entry")
 
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""

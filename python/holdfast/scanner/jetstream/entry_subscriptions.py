@@ -21,13 +21,13 @@ from holdfast.events import log_lines
 from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.key_watch import KeyWatch
-from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterable, Mapping
 
     from holdfast.scanner.jetstream.key_watch import WatchTimes, Written
     from holdfast.scanner.messages.types import SubscribeRequest
+    from holdfast.scanner.subscriptions.key import SubscriptionKey
     from holdfast.scanner.subscriptions.subscription import Subscription
 
 BUCKET = "scanner_config_"
@@ -104,9 +104,9 @@ class EntrySubscriptions:
         refused_entries = (entry.refused for _, entry in sorted(self._entries.items()))
         return [refused for refused in refused_entries if refused is not None]
 
-    def key_of(self, device: str, subscriber: str | None) -> str | None:
+    def key_of(self, subscription: SubscriptionKey) -> str | None:
         """Returns the key of the entry that a subscription is from; `None` if it is from none."""
-        return None if subscriber is None else self._keys.get(SubscriptionKey(device, subscriber))
+        return self._keys.get(subscription)
 
     async def run(self, host: EntryHost) -> None:
         """Has `host` carry out the entries, until it is cancelled."""
@@ -206,11 +206,10 @@ class EntrySubscriptions:
         had_subscription = entry.subscription is not None
         try:
             subscription = self._host.check_entry(key, written.value)
-            key_of_entry = SubscriptionKey(subscription.device, subscription.subscriber)
-            if entry.subscription not in (None, key_of_entry):
+            if entry.subscription not in (None, subscription.key):
                 await self._release(entry)
-            entry.subscription = key_of_entry
-            self._keys[key_of_entry] = key
+            entry.subscription = subscription.key
+            self._keys[subscription.key] = key
             await self._host.carry_out_entry(subscription)
         except Refused as refused:
             reason = str(refused)

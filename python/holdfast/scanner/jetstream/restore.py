@@ -89,16 +89,16 @@ class StoredSubscriptions(Placement):
 
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Removes tags of a subscription, also of a pending one."""
-        owner = SubscriptionKey(request.device_id, request.subscriber_id)
+        owner = SubscriptionKey.of(request)
         ids = request.ids
         left = [] if ids is None else without(self._pending.get(owner, []), set(ids))
         self._touch(owner)
         if left:
             self._pending[owner] = left
 
-    async def settled(self, device: str, subscriber: str) -> None:
+    async def settled(self, subscription: SubscriptionKey) -> None:
         """Waits until a changed subscription is stored; not while JetStream fails."""
-        await self._store.settled(SubscriptionKey(device, subscriber))
+        await self._store.settled(subscription)
 
     def _touch(self, owner: SubscriptionKey) -> None:
         self._pending.pop(owner, None)
@@ -107,7 +107,7 @@ class StoredSubscriptions(Placement):
 
     def _entries(self, owner: SubscriptionKey) -> Mapping[str, bytes]:
         """Returns the entries of an owner: nothing, if it is gone."""
-        if self._host.is_entry(owner.device, owner.subscriber):
+        if self._host.is_entry(owner):
             return {}
         if owner in self._pending:
             assert owner.subscriber is not None
@@ -140,7 +140,7 @@ class StoredSubscriptions(Placement):
             except (Refused, *MALFORMED_JSON) as error:
                 log_lines.refused("kept_entry_malformed", kind="kept", key=key, reason=str(error))
                 continue
-            owner = SubscriptionKey(request.device_id, request.subscriber_id)
+            owner = SubscriptionKey.of(request)
             is_ours = owner in self._store.touched or self._is_known(owner)
             if not self._has_read and not is_ours:
                 self._pending.setdefault(owner, []).append(request)
@@ -192,14 +192,10 @@ class StoredSubscriptions(Placement):
             except Refused as refused:
                 if owner not in self._logged:
                     self._logged.add(owner)
-                    self._log(logging.WARNING, "not_restored", owner, reason=str(refused))
+                    owner.log(logging.WARNING, "not_restored", reason=str(refused))
                     self._device_host.give_up(owner.device, str(refused))
                 continue
             if self._pending.get(owner) is found:
                 self._touch(owner)
                 tags = sum(len(request.tags) for request in found)
-                self._log(logging.INFO, "restored", owner, tags=tags)
-
-    @staticmethod
-    def _log(level: int, event: str, owner: SubscriptionKey, **more: object) -> None:
-        log_lines.write(level, event, device=owner.device, subscriber=owner.subscriber, **more)
+                owner.log(logging.INFO, "restored", tags=tags)

@@ -13,6 +13,7 @@ from holdfast.events import log_lines
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import UnsubscribeRequest
 from holdfast.scanner.subscriptions.health import Health
+from holdfast.scanner.subscriptions.key import SubscriptionKey
 from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
 
 if TYPE_CHECKING:
@@ -75,9 +76,9 @@ class Devices:
         if device is None or subscription.subscriber not in device.subscribers:
             return change.new
         # Without `renewed`, only a time that runs runs on, and only if the subscription has one.
-        runs = self.ttls.ends(device.id, subscription.subscriber)
+        runs = self.ttls.ends(subscription.key)
         if renewed or subscription.ttl is None or not runs:
-            self.ttls.renew(device.id, subscription.subscriber, subscription.ttl)
+            self.ttls.renew(subscription.key, subscription.ttl)
         if change.former is not None:
             self._drop(change.former)
         device.endpoint = endpoint
@@ -115,7 +116,7 @@ class Devices:
         if device is None:
             return
         if request.subscriber_id not in device.subscribers:
-            self.ttls.renew(device.id, request.subscriber_id, None)
+            self.ttls.renew(SubscriptionKey.of(request), None)
         if device.subscribers:
             self._publishers.update(device)
             if changed:

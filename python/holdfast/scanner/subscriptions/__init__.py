@@ -1,1 +1,1 @@
-"""Who has subscribed to what: devices, tags, rates, limits and health. Does no I/O."""
+"""Who has subscribed to what: devices, tags, rates, limits and health. Does no I/O, but logs."""

@@ -1,8 +1,14 @@
-"""What identifies a subscription. Does no I/O."""
+"""What identifies a subscription, and how the log names it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from holdfast.events import log_lines
+
+if TYPE_CHECKING:
+    from holdfast.scanner.messages.types import SubscribeRequest, UnsubscribeRequest
 
 
 @dataclass(frozen=True)
@@ -12,3 +18,12 @@ class SubscriptionKey:
     device: str
     subscriber: str | None = None
     """`None` for the status of the device, which is stored beside its subscriptions."""
+
+    @staticmethod
+    def of(request: SubscribeRequest | UnsubscribeRequest) -> SubscriptionKey:
+        """Returns the subscription of a request."""
+        return SubscriptionKey(request.device_id, request.subscriber_id)
+
+    def log(self, level: int, event: str, **more: object) -> None:
+        """Logs an event of the subscription."""
+        log_lines.write(level, event, device=self.device, subscriber=self.subscriber, **more)

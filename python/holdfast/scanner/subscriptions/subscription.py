@@ -20,6 +20,7 @@ from holdfast.runtime.text import quote
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import TagRequest
 from holdfast.scanner.subscriptions.device import NO_OPTIONS, Source, TagOptions
+from holdfast.scanner.subscriptions.key import SubscriptionKey
 from holdfast.scanner.subscriptions.plan import Plan
 from holdfast.scanner.subscriptions.tag import AREA_OF_CODE, CODE_OF_AREA, Tag
 from holdfast.scanner.subscriptions.write_access import read_only
@@ -61,6 +62,11 @@ class Subscription:
     """Seconds."""
     profile: str | None
     """The profile whose tags are among `tags`: all of them, unless it was not expanded."""
+
+    @property
+    def key(self) -> SubscriptionKey:
+        """What identifies it."""
+        return SubscriptionKey(self.device, self.subscriber)
 
 
 def subscription_of(

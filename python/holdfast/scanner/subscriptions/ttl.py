@@ -10,10 +10,11 @@ import time
 from typing import TYPE_CHECKING
 
 from holdfast.runtime import tasks
-from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
+
+    from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 
 class SubscriptionTtls:
@@ -26,9 +27,8 @@ class SubscriptionTtls:
         self._is_running = False
         self._changed = asyncio.Event()
 
-    def renew(self, device: str, subscriber: str, ttl: int | None) -> None:
+    def renew(self, key: SubscriptionKey, ttl: int | None) -> None:
         """Starts the time of a subscription again; without `ttl`, it does not end."""
-        key = SubscriptionKey(device, subscriber)
         if ttl is None:
             self._ttls.pop(key, None)
             self._ends.pop(key, None)
@@ -37,9 +37,9 @@ class SubscriptionTtls:
         self._ends[key] = self._clock() + ttl
         self._changed.set()
 
-    def ends(self, device: str, subscriber: str) -> bool:
+    def ends(self, key: SubscriptionKey) -> bool:
         """Returns whether the time of a subscription runs."""
-        return SubscriptionKey(device, subscriber) in self._ends
+        return key in self._ends
 
     def connected(self, is_connected: bool) -> None:
         """Stops the time of all subscriptions, or starts it again."""
