@@ -568,7 +568,7 @@ class _Search:
         that size. A range that was found before is not read again.
         """
         # The exact search reads every address: the hit was its block of 1.
-        pace = self._pace(max(size, 2 if self._survey.exact else 1))
+        pace = _Pace(self._found, max(size, 2 if self._survey.exact else 1))
         following = self._found.range_of(at) or self._found.next_range(at)
         stop = self._stop if following is None else following.start
         while (left := (stop - at) // self._found.width) > 0:
@@ -588,7 +588,7 @@ class _Search:
     def _follow_back(self, at: int, floor: int) -> Steps[int]:
         """Reads from `at` down to the first address that fails, or to `floor`. Returns the size of
         the largest block that could be read."""
-        pace = self._pace(1)
+        pace = _Pace(self._found, 1)
         largest = 1
         while left := (at + 1 - floor) // self._found.width:
             count = min(pace.count, left)
@@ -600,9 +600,6 @@ class _Search:
                 break
             pace.changed(count, outcome)
         return largest
-
-    def _pace(self, count: int) -> _Pace:
-        return _Pace(self._found, count)
 
     def _read(self, address: int, count: int) -> Steps[Outcome]:
         """Reads `count` times the width, and records the result for the addresses."""

@@ -61,9 +61,8 @@ def description(contents: Sequence[Sequence[int]], now: float | None) -> tuple[f
     form = _form(contents[-1])
     if form is None:
         return None
-    times = [_time(each, form) for each in contents]
-    known = [time for time in times if time is not None]
-    if len(known) < len(times):
+    known = [time for each in contents if (time := _time(each, form)) is not None]
+    if len(known) < len(contents):
         return None
     resolution = 1 if "s" in form else 60
     bits = RARE + math.log2((RANGES["Y"].stop - RANGES["Y"].start) * 365 * 86_400 / resolution)
@@ -81,12 +80,8 @@ def description(contents: Sequence[Sequence[int]], now: float | None) -> tuple[f
 def _form(registers: Sequence[int]) -> str | None:
     """The form of a date and time; `None` if the registers are none."""
     digits = [_decimal(byte) for each in registers[:MAX_REGISTERS] for byte in divmod(each, 256)]
-    for form in FORMS:
-        if len(digits) < len(form):
-            continue
-        if _belong(digits[: len(form)], form):
-            return form
-    return None
+    fitting = (form for form in FORMS if len(form) <= len(digits))
+    return next((form for form in fitting if _belong(digits[: len(form)], form)), None)
 
 
 def _belong(digits: Sequence[int | None], form: str) -> bool:

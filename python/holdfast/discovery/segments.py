@@ -290,8 +290,12 @@ class _Lattice:
         # Sums over all divisions of the registers before a place; and of those ending with a kind.
         self._before: list[float] = [0.0]
         self._ending: list[dict[Key, float]] = [{} for _ in range(self._size + 1)]
+        # The same of the registers after a place, and of those beginning with a kind: the former
+        # with how rare the first type is, the latter without.
+        self._after = [0.0] * (self._size + 1)
+        self._beginning: list[dict[Key, float]] = [{} for _ in range(self._size + 1)]
         self._forward()
-        self._after, self._beginning = self._backward()
+        self._backward()
         self.total = self._before[self._size]
 
     def values(self) -> Iterator[Value]:
@@ -300,8 +304,7 @@ class _Lattice:
 
     def chance(self, value: Value) -> float:
         """The probability that a value is one, with this habit."""
-        ahead = self._ahead(value, self._after, self._beginning)
-        before = self._entering(value)
+        before, ahead = self._entering(value), self._ahead(value)
         return float(2 ** (before - value.bits + ahead - self.total))
 
     def _entering(self, value: Value) -> float:
@@ -315,17 +318,15 @@ class _Lattice:
             return any_type - OTHER_TYPE
         return _either(any_type - OTHER_TYPE, same - SAME_TYPE + value.saved)
 
-    def _ahead(
-        self, value: Value, after: Sequence[float], beginning: Sequence[Mapping[Key, float]]
-    ) -> float:
+    def _ahead(self, value: Value) -> float:
         """The weight of all that is behind a value."""
         stop = value.stop
         if stop == self._size:
             return 0.0
-        same = beginning[stop].get(value.key)
+        same = self._beginning[stop].get(value.key)
         if same is None:
-            return after[stop] - OTHER_TYPE
-        return _either(after[stop] - OTHER_TYPE, same - SAME_TYPE)
+            return self._after[stop] - OTHER_TYPE
+        return _either(self._after[stop] - OTHER_TYPE, same - SAME_TYPE)
 
     def _forward(self) -> None:
         incoming: list[list[Value]] = [[] for _ in range(self._size + 1)]
@@ -338,21 +339,16 @@ class _Lattice:
                 ending[value.key] = _either(ending.get(value.key, -math.inf), weight)
             self._before.append(_sum(ending.values()))
 
-    def _backward(self) -> tuple[list[float], list[dict[Key, float]]]:
-        """The sums over all divisions of the registers after a place, and of those that begin with
-        a kind: the former with how rare the first type is, the latter without.
-        """
-        after = [0.0] * (self._size + 1)
-        beginning: list[dict[Key, float]] = [{} for _ in range(self._size + 1)]
+    def _backward(self) -> None:
         for at in range(self._size - 1, -1, -1):
+            beginning = self._beginning[at]
             each: list[float] = []
             for value in self._from[at]:
-                weight = self._ahead(value, after, beginning) - value.bits
-                known = beginning[at].get(value.key, -math.inf)
-                beginning[at][value.key] = _either(known, weight + value.saved)
+                weight = self._ahead(value) - value.bits
+                known = beginning.get(value.key, -math.inf)
+                beginning[value.key] = _either(known, weight + value.saved)
                 each.append(weight - _rarity(value, self.habit))
-            after[at] = _sum(each)
-        return after, beginning
+            self._after[at] = _sum(each)
 
 
 def _rarity(value: Value, habit: Habit) -> float:

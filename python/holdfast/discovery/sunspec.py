@@ -253,11 +253,11 @@ class _Group:
         if isinstance(count, str):
             _, found = self._number(count) or (0, 0)
             count = 0 if found == 0xFFFF else found
-            fits = False
-        else:
-            fits = count == 0
-        index = 1
-        while self.stop < len(self.registers) and (fits or index <= count):
+        elif count == 0:
+            count = len(self.registers)
+        for index in range(1, count + 1):
+            if self.stop >= len(self.registers):
+                return
             # Names have a number wherever devices differ in how many there are.
             name = definition["name"] if is_single else f"{definition['name']}_{index}"
             prefix = f"{self.prefix}{name}_"
@@ -266,7 +266,6 @@ class _Group:
                 return
             self._inner.append(group)
             self.stop = group.stop
-            index += 1
 
     def _number(self, name: str) -> tuple[int, int] | None:
         """Offset and raw value of a point of this group or one around it."""
