@@ -219,11 +219,11 @@ def write_range(
     if not hasattr(items, "__len__"):
         raise TypeError(f"values are {type(items).__name__}, not a sequence of integers")
     make = Request.write_coils if area == "coils" else Request.write_registers
-    if len(items) <= limit or not split:
-        if len(items) > limit:
-            raise TooManyValues(len(items), limit)
+    if len(items) <= limit:
         yield make(address, items)
         return
+    if not split:
+        raise TooManyValues(len(items), limit)
     size = _whole_elements(limit, element)
     starts = _starts(address, len(items), size)
     try:

@@ -150,12 +150,8 @@ class TagReader:
         ended: ModbusError | None = None
         blocks: list[_Block] = []
         for block in sorted(self._blocks, key=lambda each: each.rank):
-            if block.refused is not None:
-                self._fail(block, block.refused)
-                blocks.append(block)
-                continue
-            if ended is not None:
-                self._fail(block, ended)
+            if failure := block.refused or ended:
+                self._fail(block, failure)
                 blocks.append(block)
                 continue
             replacements, error = yield from self._request(block)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 from urllib.parse import parse_qsl, unquote, urlsplit
 
@@ -124,9 +124,9 @@ def parse(url: str) -> Target:
         except ValueError as error:
             raise ValueError(f"{url!r}: {error}") from None
         return NetworkTarget(scheme, host, port, tls, tolerance)
-    if scheme in ("rtu", "ascii"):
+    if scheme in SERIAL:
         return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
-    near = suggestion(scheme, (*TRANSPORTS, *SERIAL)) if scheme else ""
+    near = suggestion(scheme, ALL) if scheme else ""
     raise ValueError(f"{_shown(url)} is not the URL of a device, allowed: {FORMS}{near}")
 
 
@@ -223,15 +223,13 @@ def _echo(text: str) -> bool | str:
     return text if text == "auto" else _up_to(1)(text) == 1
 
 
-def _flag(schemes: tuple[str, ...]) -> _Option:
-    return _Option("0, 1", _one_of("0", "1", read=lambda text: text == "1").read, schemes)
-
-
 def _text(text: str) -> str:
     if not text or "\0" in text:
         raise ValueError(text)
     return text
 
+
+_FLAG = replace(_one_of("0", "1", read=lambda text: text == "1"), schemes=ALL)
 
 OPTIONS: Mapping[str, _Option] = {
     "baud": _Option("50 to 4000000", _baud),
@@ -241,15 +239,15 @@ OPTIONS: Mapping[str, _Option] = {
     "silence": _Option("seconds, up to 10", _seconds, ("rtu",)),
     "rs485": _one_of("rts", "rts-low"),
     "accept_unit": _Option(f"any, 0 to {MAX_UNIT}", _unit, ALL),
-    "pad": _flag(ALL),
+    "pad": _FLAG,
     "echo": _Option("0, 1, auto", _echo, tuple(each for each in ALL if each not in MBAP)),
     "pause": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, ALL),
     "pause_after_connect": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, ALL),
     "retries": _Option(f"0 to {MAX_RETRIES}", _up_to(MAX_RETRIES), ALL),
-    "retry_busy": _flag(ALL),
+    "retry_busy": _FLAG,
     "close_after": _Option(f"0 to {MAX_CLOSE_AFTER}", _up_to(MAX_CLOSE_AFTER), ALL),
     "reconnect": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, ALL),
-    "write_multiple": _flag(ALL),
+    "write_multiple": _FLAG,
     **dict.fromkeys(
         ("ca", "cert", "key", "key_passphrase_file"), _Option("paths of files", _text, SECURE)
     ),
