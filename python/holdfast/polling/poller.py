@@ -126,7 +126,9 @@ class Poller:
         if not len(listed):
             raise ValueError("tags is empty, allowed: at least one tag")
         if name is None:
-            name = self._free(url.partition("://")[2] or url)
+            name = url.partition("://")[2] or url
+            if name in self._core_names:
+                name = f"{name}#{next(self._names)}"
         if name in self._core_names:
             raise ValueError(f"device {name}: the name is already in use")
         place = shared_connection(target)
@@ -164,9 +166,6 @@ class Poller:
         self._readers[core_name] = reader
         self._core_names[name] = core_name
         return name
-
-    def _free(self, name: str) -> str:
-        return name if name not in self._core_names else f"{name}#{next(self._names)}"
 
     def remove(self, name: str) -> None:
         """Stops polling a device. Writes to it that wait are not sent, and fail.

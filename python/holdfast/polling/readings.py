@@ -120,7 +120,7 @@ class Reader:
             if data is None or decode is None:
                 for tag in tags:
                     # A block that overlaps this one may have its value.
-                    found.setdefault(tag.name, self._none(tag, time, fault))
+                    found.setdefault(tag.name, Reading(self.device, tag, None, time, fault))
                 continue
             for tag, raw in zip(tags, decode(data), strict=True):
                 found[tag.name] = self._reading(tag, raw, time)
@@ -142,7 +142,8 @@ class Reader:
             if data is not None:
                 yield tag.name, self._reading(tag, value_of(tag, data, tag.address), pieces[-1][5])
             elif faulty:
-                yield tag.name, self._none(tag, faulty[0][5], faulty[0][4])
+                *_, fault, time = faulty[0]
+                yield tag.name, Reading(self.device, tag, None, time, fault)
             elif blocks:
                 # A request of at most `max_registers` may not reach from a value to its scale.
                 whole = "whole" if tag.source is None else "together with its scale"
@@ -163,9 +164,6 @@ class Reader:
         if type(raw) is Undecoded:
             return Reading(self.device, tag, None, time, 0, raw.error)
         return Reading(self.device, tag, tag.value(raw), time)
-
-    def _none(self, tag: Tag, time: float, fault: int) -> Reading:
-        return Reading(self.device, tag, None, time, fault)
 
 
 def _overlap(tag: Tag, block: PolledBlock) -> bool:
