@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import ipaddress
 from ipaddress import IPv4Address, IPv4Network, IPv6Address, IPv6Network
-from typing import TYPE_CHECKING, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -64,11 +64,8 @@ def holds(networks: Iterable[Network], address: Address) -> bool:
 
 def covers(networks: Iterable[Network], network: Network) -> bool:
     """Returns whether `networks` together contain every address of `network`."""
-    if isinstance(network, IPv4Network):
-        four = ipaddress.collapse_addresses(n for n in networks if isinstance(n, IPv4Network))
-        return any(network.subnet_of(wider) for wider in four)
-    six = ipaddress.collapse_addresses(n for n in networks if isinstance(n, IPv6Network))
-    return any(network.subnet_of(wider) for wider in six)
+    same: list[Any] = [each for each in networks if each.version == network.version]
+    return any(network.subnet_of(wider) for wider in ipaddress.collapse_addresses(same))
 
 
 def bracketed(host: str) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from cryptography import x509
 
 from holdfast.net.certificates.parser import MALFORMED, certificates, revocation_lists
+from holdfast.runtime.text import counted
 
 if TYPE_CHECKING:
     from holdfast.net.certificates.pem import File
@@ -38,10 +39,8 @@ class Expiry:
             return f"{self.what} is not valid before {self.begins:%Y-%m-%d %H:%M} UTC"
         if self.ends - now <= SOON:
             days = (self.ends - now).days
-            left = (
-                "in less than a day" if days < 1 else "in 1 day" if days == 1 else f"in {days} days"
-            )
-            return f"{self.what} expires {left}, on {self.ends:%Y-%m-%d}"
+            left = "less than a day" if days < 1 else counted(days, "day")
+            return f"{self.what} expires in {left}, on {self.ends:%Y-%m-%d}"
         return None
 
 

@@ -6,7 +6,7 @@ socket and put into it by the derived classes.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, LogLevel, MQTTErrorCode, MQTTProtocolVersion
@@ -107,19 +107,12 @@ class BrokerClient(Client):
         Does not tell the broker the largest packet: Mosquitto 2.0 counts each message that it then
         does not send as one on its way, until it sends none.
         """
-        settings = self._settings
-        if not self._five:
-            self.connect(settings.host, settings.port, settings.keep_alive)
-            return
-        properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-        properties.SessionExpiryInterval = self._expiry
-        self.connect(
-            settings.host,
-            settings.port,
-            settings.keep_alive,
-            clean_start=not self._expiry,
-            properties=properties,
-        )
+        settings, more = self._settings, dict[str, Any]()
+        if self._five:
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties.SessionExpiryInterval = self._expiry
+            more = {"clean_start": not self._expiry, "properties": properties}
+        self.connect(settings.host, settings.port, settings.keep_alive, **more)
 
     @property
     def connection(self) -> BrokerSocket:

@@ -188,8 +188,8 @@ class MessageTransport(TcpTransport):
             self._note_pong()
         elif line.startswith(b"INFO"):
             info = _decoded(line.removeprefix(b"INFO"))
-            if self._requires_tls:
-                _check_tls(info)
+            if self._requires_tls and not info.get("tls_required"):
+                raise Error("the server does not use TLS")
             return _info_line(info)
         elif not line.startswith((b"+OK", b"-ERR")):
             raise ProtocolError("nats: unknown protocol")
@@ -313,11 +313,6 @@ def _is_url(url: object) -> bool:
 
 def _info_line(info: dict[str, Any]) -> bytes:
     return b"INFO " + json.dumps(info).encode() + END
-
-
-def _check_tls(info: dict[str, Any]) -> None:
-    if not info.get("tls_required"):
-        raise Error("the server does not use TLS")
 
 
 def _error_text(rest: bytes) -> bytes:
