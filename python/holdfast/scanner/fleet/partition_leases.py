@@ -71,6 +71,7 @@ class PartitionLeases:
         """The heartbeat of the event loop of `start`."""
         self._is_connected = False
         self.settings, self.node = settings, settings.node
+        self._key = f"{NODE}{self.node}"
         self.terms = terms
         self._terms_digest = digest(terms.encoded())
         self._node_about = about
@@ -134,7 +135,7 @@ class PartitionLeases:
     @property
     def may_publish(self) -> bool:
         """Whether the node was not stopped for so long that others may poll its devices."""
-        return self.leases.is_held(f"{NODE}{self.node}")
+        return self.leases.is_held(self._key)
 
     def epoch(self, partition: int) -> int:
         """The number of messages about the devices of a partition; 0 without its lease.
@@ -206,10 +207,9 @@ class PartitionLeases:
 
     async def join(self) -> None:
         """Takes the lease of the node. Raises `FleetRefused` if its name is in use."""
-        key = f"{NODE}{self.node}"
-        self._thread.want([key])
+        self._thread.want([self._key])
         self._named_since = time.monotonic()
-        while not self.leases.since(key):
+        while not self.leases.since(self._key):
             self._check_name()
             await asyncio.sleep(GATHER_S)
         log_lines.write(
@@ -225,7 +225,7 @@ class PartitionLeases:
 
         One of a process that has died would have ended by then.
         """
-        holder = self.leases.holder(f"{NODE}{self.node}")
+        holder = self.leases.holder(self._key)
         now = time.monotonic()
         if holder is None or not self.is_other(holder) or self.leases.reason is not None:
             self._named_since = now
@@ -262,7 +262,7 @@ class PartitionLeases:
         }
         target = assigned(self.settings.partitions, nodes, held)
         mine = {f"{PARTITION}{each}" for each, node in target.items() if node == self.node}
-        self._thread.want([f"{NODE}{self.node}", *mine])
+        self._thread.want([self._key, *mine])
         self._handover.begin(key for key in self._held_partitions() if key not in mine)
 
     def _held_partitions(self) -> list[str]:
@@ -273,10 +273,9 @@ class PartitionLeases:
         self._is_leaving = True
         self._show()
         self._thread.want([])
-        node = f"{NODE}{self.node}"
-        await self._thread.renew_now(node)
+        await self._thread.renew_now(self._key)
         await self._handover.at_once(self._held_partitions())
-        await self._thread.give_back(node, 0.0)
+        await self._thread.give_back(self._key, 0.0)
         log_lines.write(logging.INFO, "fleet_left", fleet=self.settings.name, node=self.node)
 
     def _settle(self, key: str) -> None:
