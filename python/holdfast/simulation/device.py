@@ -192,14 +192,13 @@ class SimulatedDevice:
             if isinstance(value, list)
             else nearest(tag, value)
         )
+        bits = raw if isinstance(raw, list) else [raw]
         if tag.of_type.base == "bit":
-            bits = raw if isinstance(raw, list) else [raw]
             [mask] = values.encode(True, tag.of_type.element, tag.order)
             for at, bit in enumerate(bits, tag.address):
                 old = registers.get(at, 0)
                 registers[at] = old | mask if bit else old & ~mask
         elif tag.of_bits:
-            bits = raw if isinstance(raw, list) else [raw]
             registers.update(enumerate(map(int, bits), tag.address))
         else:
             made = values.encode(raw, tag.type, tag.order, encoding=tag.encoding)

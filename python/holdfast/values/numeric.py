@@ -81,7 +81,7 @@ class Number(Kind):
                 value = self._number(value)
             data = self._one.pack(value)
         except (struct.error, OverflowError):
-            raise self._too_large(value) from None
+            raise _outside(value, self._least, self._most, self.name) from None
         return self._moved(data)
 
     def pack_many(self, values: Sequence[Any]) -> bytes:
@@ -97,10 +97,6 @@ class Number(Kind):
     @abstractmethod
     def _number(self, value: Any) -> Any:
         """Converts a value of another type for `struct`. Raises `DoesNotFit`."""
-
-    def _too_large(self, value: Any) -> DoesNotFit:
-        allowed = f"{self._least} to {self._most} of {self.name}"
-        return DoesNotFit(f"{shown(value)} is outside {allowed}")
 
     def _moved(self, data: bytes) -> bytes:
         """Applies an order of eight letters. `struct` handles reversed orders."""
@@ -172,8 +168,12 @@ class Bcd(Bytewise):
         number = _required_integer(value, self.name)
         least, most = limits(self.name)
         if not least <= number <= most:
-            raise DoesNotFit(f"{shown(value)} is outside {least} to {most} of {self.name}")
+            raise _outside(value, least, most, self.name)
         return self.arrange(bytes.fromhex(f"{number:0{2 * self.width}d}"))
+
+
+def _outside(value: Any, least: float, most: float, name: str) -> DoesNotFit:
+    return DoesNotFit(f"{shown(value)} is outside {least} to {most} of {name}")
 
 
 def _required_integer(value: Any, name: str) -> int:

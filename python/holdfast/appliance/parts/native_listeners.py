@@ -168,23 +168,24 @@ def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
 def _rule(
     rule: RuleConfig, config: Config, memories: Mapping[str, Memory], links: Links
 ) -> _core.Rule:
+    units = dict(unit_rights(rule))
     own = {
         unit: rights
-        for unit, rights in unit_rights(rule)
+        for unit, rights in units.items()
         if (rights.access, rights.functions, rights.deny)
         != (rule.access, rule.functions, rule.deny)
         or rights.has_ranges
     }
     return _core.Rule(
-        _targets(dict(unit_rights(rule)), memories, links),
+        _targets(units, memories, links),
         sources=[str(source) for source in rule.sources],
         access=rule.access,
         functions=rule.functions,
         deny=rule.deny,
         roles=getattr(rule, "roles", None),
         narrowed={unit: _narrowed(rights) for unit, rights in own.items()},
-        exception_status=_exception_status(dict(unit_rights(rule))),
-        fifo=_fifo(config, dict(unit_rights(rule))),
+        exception_status=_exception_status(units),
+        fifo=_fifo(config, units),
     )
 
 

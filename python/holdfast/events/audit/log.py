@@ -143,23 +143,20 @@ class Audit:
 
     def rotate(self) -> None:
         """Puts the file aside as if it were full, and begins a new one. An empty file stays."""
-        with self._lock:
-            if self._file is None or self._is_closed:
-                return
-            try:
-                self._file.check()
-                if not self._file.is_empty:
-                    self._file.rotate()
-            except OSError:
-                self._fail()
+        self._check(puts_aside=True)
 
     def reopen(self) -> None:
         """Opens a new file if something else has renamed or deleted the present one."""
+        self._check(puts_aside=False)
+
+    def _check(self, *, puts_aside: bool) -> None:
         with self._lock:
             if self._file is None or self._is_closed:
                 return
             try:
                 self._file.check()
+                if puts_aside and not self._file.is_empty:
+                    self._file.rotate()
             except OSError:
                 self._fail()
 
