@@ -2,7 +2,6 @@
 
 - Many messages are sent with one call, and many confirmations read with one.
 - A packet over the size limit is not kept in memory while it arrives.
-- While commands are taken, pings find out how long one may have been on its way.
 - paho does the rest: CONNECT, SUBSCRIBE and DISCONNECT.
 
 All methods are for the thread that serves the connection.
@@ -12,7 +11,6 @@ from __future__ import annotations
 
 import logging
 import socket
-import time
 from collections import deque
 from itertools import islice
 from math import inf
@@ -29,6 +27,7 @@ from holdfast.net.mqtt.client import BrokerClient
 from holdfast.net.mqtt.packets import MAX_HEAD_BYTES, acknowledgement, parse_publish
 from holdfast.net.mqtt.stream import Packets
 from holdfast.outputs.mqtt.delivery import MAX_IN_FLIGHT, Message, packed, size_of
+from holdfast.outputs.mqtt.late_commands import PING_INTERVAL_S, Pings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -52,12 +51,6 @@ MAX_TOPICS_PER_SUBSCRIBE = 8
 
 PUBLISH, PUBACK, PINGRESP = 0x30, 0x40, 0xD0
 _PING = bytes((0xC0, 0))
-
-PING_INTERVAL_S = 2.0
-"""Seconds between two pings while commands are taken."""
-
-MAX_COMMAND_AGE_S = 5.0
-"""Seconds that a command may have been on its way from the broker."""
 
 QUOTA_EXCEEDED = 0x97
 READ_BYTES = 262_144
@@ -101,9 +94,7 @@ class Connection(BrokerClient):
         self._written: list[Delivery] = []
         self._pinged: list[Delivery] = []
         """What the answer to the ping that is on its way confirms."""
-        self._is_pinging = False
-        self._pinged_at = self._answered_at = 0.0
-        """When the last ping was sent, and when the last one that is answered was."""
+        self._pings = Pings()
         self._next = FIRST_IDENTIFIER
 
     def accepted(self, properties: Properties | None) -> None:
@@ -111,7 +102,7 @@ class Connection(BrokerClient):
         self._max_in_flight = min(
             getattr(properties, "ReceiveMaximum", self._max_in_flight), self._max_in_flight
         )
-        self._pinged_at = self._answered_at = time.monotonic()
+        self._pings = Pings()
         self._largest = getattr(properties, "MaximumPacketSize", None)
         self._retains = bool(getattr(properties, "RetainAvailable", 1))
         self._qos = min(getattr(properties, "MaximumQoS", self._qos), self._qos)
@@ -165,7 +156,7 @@ class Connection(BrokerClient):
             if delivery.sent == len(delivery.messages):
                 self._waiting.popleft()
         if self._written and self._proves:
-            if not self._is_pinging:
+            if not self._pings.is_waiting:
                 self._ping()
         elif self._written and not self.connection.unsent:
             news = self._confirm(self._written)
@@ -177,9 +168,9 @@ class Connection(BrokerClient):
         """
         if not (self.is_accepted and self.is_open):
             return
-        seconds = time.monotonic() - self._pinged_at
+        seconds = self._pings.age()
         keep_alive = self.keepalive or inf  # The broker may have set it to 0, which is none.
-        if not self._is_pinging:
+        if not self._pings.is_waiting:
             if seconds >= min(keep_alive, PING_INTERVAL_S if self._writes else inf):
                 self._ping()
         elif seconds >= keep_alive:
@@ -188,17 +179,8 @@ class Connection(BrokerClient):
     def _ping(self) -> None:
         if self._proves:
             self._pinged, self._written = self._written, []
-        self._pinged_at, self._is_pinging = time.monotonic(), True
+        self._pings.sent()
         self.connection.put(_PING)
-
-    def _lateness(self) -> str | None:
-        """Why what arrives may be late: the network stood still, or this side has much to send.
-
-        The broker has sent it after it answered the last answered ping: it is no older than that.
-        """
-        age = time.monotonic() - self._answered_at
-        late = f"it may be {age:.0f} s late: no ping was answered since"
-        return late if age > MAX_COMMAND_AGE_S else None
 
     @staticmethod
     def _confirm(deliveries: list[Delivery]) -> bool:
@@ -266,8 +248,8 @@ class Connection(BrokerClient):
                 news |= self._confirmed(body)
             elif first & 0xF0 == PUBLISH:
                 self._received(first, body, size)
-            elif first == PINGRESP and self._is_pinging:
-                self._is_pinging, self._answered_at = False, self._pinged_at
+            elif first == PINGRESP and self._pings.is_waiting:
+                self._pings.answered()
                 news |= self._confirm(self._pinged)
             elif self.pass_on(first, body) != MQTTErrorCode.MQTT_ERR_SUCCESS:
                 self.end(self.trouble or "the broker sent a malformed packet")
@@ -299,7 +281,7 @@ class Connection(BrokerClient):
     def _received(self, first: int, body: bytes | bytearray, size: int) -> None:
         message = parse_publish(first, body, size, five=self._five)
         if self._writes:
-            message = message._replace(lateness=self._lateness())
+            message = message._replace(lateness=self._pings.lateness())
         if message.qos == 1:
             self.connection.put(acknowledgement(PUBACK, message.identifier))
         elif message.qos == 2:
