@@ -1,7 +1,10 @@
 use super::*;
+use crate::error::{Refusal, Refused};
 use crate::follower::Follower;
+use crate::memory::several_memories::write_across;
 use crate::mirrored::Freshness;
 use crate::seal::GateMode;
+use crate::step::{Action, Done, Step, StepWrite};
 
 const REGISTERS: Area = Area::HoldingRegisters;
 
