@@ -192,6 +192,40 @@ def test_layouts_and_tags_take_them() -> None:
             Layout([("a", "uint16", wrong)])
 
 
+def test_the_numbers_of_a_tag_are_plain() -> None:
+    tag = holdfast.Tag(
+        "a",
+        "holding_registers",
+        0,
+        "uint64",
+        scale=numpy.int16(100),
+        offset=numpy.int8(-100),
+        min=numpy.uint8(0),
+        max=numpy.float64(1e9),
+        deadband=numpy.float64(0.5),
+        states={numpy.int64(0): "off", YES * TWO * 100: "on"},
+        null=[numpy.uint16(65535)],
+    )
+    numbers = [tag.scale, tag.offset, tag.min, tag.max, tag.deadband, *tag.states, *tag.null]
+    assert numbers == [100, -100, 0, 1e9, 0.5, 0, 200, 65535]
+    assert [type(number) for number in numbers] == [int, int, int, float, float, int, int, int]
+    large = tag.value(2**63)
+    assert (type(large), large, tag.value(65535)) == (int, 100 * 2**63 - 100, None)
+    assert tag.raw(numpy.uint8(200)) == 3
+    assert holdfast.Tag("b", "holding_registers", 0, scale=numpy.float64(0.1)).value(215) == 21.5
+    switch = holdfast.Tag("c", "coils", 0, states={NO: "off", YES: "on"})
+    assert [(type(number), number) for number in switch.states] == [(int, 0), (int, 1)]
+
+
+@pytest.mark.parametrize(
+    "wrong", [numpy.float32(0.1), numpy.float16(1), YES, numpy.float64("nan"), numpy.str_("1")]
+)
+def test_other_numbers_of_a_tag_are_refused(wrong: Any) -> None:
+    for key in ("scale", "offset", "min", "max", "deadband"):
+        with pytest.raises(TagError, match=f"^{key} is .*, allowed: a finite number, int or flo"):
+            holdfast.Tag("a", "holding_registers", 0, **{key: wrong})
+
+
 def test_raw_ingest_takes_them() -> None:
     assert raw_ingest.encode(
         "holding_registers", TWO, numpy.array([5, 6], "u2"), unit=SMALL

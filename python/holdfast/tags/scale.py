@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from holdfast.protocol import READ_LIMITS
 from holdfast.tags.base import BaseTag, TagError
 from holdfast.values.digits import decimal_of
+from holdfast.values.errors import shown
+from holdfast.values.integers import as_integer
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
@@ -106,12 +108,9 @@ def linear_of(scale: float, offset: float) -> Linear:
 
 
 class Linear:
-    """A scale and an offset. Raises `TagError` for a scale of 0 and for infinite numbers."""
+    """A scale and an offset, both finite. Raises `TagError` for a scale of 0."""
 
     def __init__(self, scale: float, offset: float) -> None:
-        for name, number in (("scale", scale), ("offset", offset)):
-            if not is_finite(number):
-                raise TagError(name, f"{name} is {number}, allowed: a finite number")
         if scale == 0:
             raise TagError("scale", "scale is 0, allowed: any other number")
         self._scale, self._offset = _exact(scale), _exact(offset)
@@ -136,6 +135,19 @@ class Linear:
     def number(self, value: float) -> Fraction:
         """The number in the registers for a finite value."""
         return (_exact(value) - self._offset) / self._scale
+
+
+def plain_number(key: str, given: object) -> float:
+    """A finite number of a tag as a plain `int` or `float`: integers of NumPy would wrap.
+
+    Raises `TagError` for anything else. So for a `float32` of NumPy, which has other digits as a
+    `float`: 0.1 would be 0.10000000149011612.
+    """
+    number = float(given) if isinstance(given, float) else as_integer(given)
+    if number is None or not is_finite(number):
+        allowed = "a finite number, int or float"
+        raise TagError(key, f"{key} is {shown(given)}, allowed: {allowed}")
+    return number
 
 
 def is_finite(number: float) -> bool:

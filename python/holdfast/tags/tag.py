@@ -10,7 +10,7 @@ from typing import Any
 
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
 from holdfast.tags.base import Marker, Scaled, TagError
-from holdfast.tags.scale import Linear, RegisterScale, is_finite
+from holdfast.tags.scale import Linear, RegisterScale, plain_number
 from holdfast.tags.writing import Rounding, WritableTag, unwritable
 from holdfast.types import AREAS, BIT_AREAS, Area
 from holdfast.values import (
@@ -22,7 +22,8 @@ from holdfast.values import (
     encode,
 )
 from holdfast.values.digits import decimal_of
-from holdfast.values.integers import as_integer
+from holdfast.values.errors import shown
+from holdfast.values.integers import as_boolean, as_integer
 from holdfast.values.numeric import limits
 from holdfast.values.orders import DEFAULT_ORDER
 from holdfast.values.types import Type, parsed
@@ -90,6 +91,8 @@ class Tag(WritableTag):
         if last > LAST_ADDRESS:
             found = f"{self.type} from address {self.address} ends at {last}"
             raise TagError("address", f"{found}, allowed: up to {LAST_ADDRESS}")
+        if isinstance(self.null, str | bytes) or not isinstance(self.null, Iterable):
+            raise TagError("null", f"null is {shown(self.null)}, allowed: a set, as in {{65535}}")
         try:
             null = (as_decoded(marker, self.of_type, self.encoding) for marker in self.null)
             self._put("null", frozenset(null))
@@ -107,23 +110,29 @@ class Tag(WritableTag):
     """Of a scale in a register, only the offset."""
 
     def _check_number(self) -> None:
+        for key in _NUMBERS:
+            given = getattr(self, key)
+            is_register = key == "scale" and isinstance(given, RegisterScale)
+            if given is not getattr(Tag, key) and not is_register:
+                self._put(key, plain_number(key, given))
         scale = 1 if isinstance(self.scale, RegisterScale) else self.scale
         self._put("_linear", Linear(scale, self.offset))
         if not self.is_number:
-            for key in ("scale", "offset", "min", "max", "deadband"):
+            for key in _NUMBERS:
                 if (given := getattr(self, key)) != getattr(Tag, key):
                     raise TagError(key, f"{key} is {given}, allowed: only with numbers")
         if isinstance(self.scale, RegisterScale):
             self.scale.check(self)
-        if not (is_finite(self.deadband) and self.deadband >= 0):
+        if self.deadband < 0:
             found = f"deadband is {self.deadband}"
             raise TagError("deadband", f"{found}, allowed: a finite number from 0")
         if self.min is not None and self.max is not None and self.min > self.max:
             raise TagError("max", f"max is {self.max}, allowed: at least min, {self.min}")
+        if not isinstance(self.states, Mapping):
+            raise TagError("states", f"states is {shown(self.states)}, allowed: names by number")
         if self.states and (self.is_float or self.of_type.base in ("string", "bytes")):
             raise TagError("states", f"found states of {self.type}, allowed: integers and bits")
-        for state in self.states:
-            self._check_state(state)
+        self._put("states", {self._state(key): name for key, name in self.states.items()})
         if len(set(self.states.values())) < len(self.states):
             names = list(self.states.values())
             twice = next(name for name in names if names.count(name) > 1)
@@ -132,10 +141,14 @@ class Tag(WritableTag):
             message = "allowed: only with integers without states"
             raise TagError("round", f"round is {self.round}, {message}")
 
-    def _check_state(self, state: int) -> None:
-        """Raises `TagError` for a number that the registers never hold."""
+    def _state(self, given: object) -> int:
+        """The number of a state. Raises `TagError` for one that the registers never hold."""
+        bit = as_boolean(given)
+        state = as_integer(given) if bit is None else int(bit)
+        if state is None:
+            raise TagError("states", f"found the state {shown(given)}, allowed: an integer")
         if isinstance(self.scale, RegisterScale):
-            return
+            return state
         number = self._linear.number(state)
         if number.denominator != 1:
             found = f"{state} is between two values of the registers"
@@ -144,6 +157,7 @@ class Tag(WritableTag):
         if not least <= number <= most:
             found = f"{state}" if number == state else f"{state}, {number} in the registers,"
             raise TagError("states", f"{found} is outside {least} to {most} of {self.type}")
+        return state
 
     def _check_writable(self) -> None:
         if self.writable and (flaw := self.unwritable) is not None:
@@ -225,6 +239,8 @@ class Tag(WritableTag):
         """The name of a value, if it has one. With a scale of 0.5, 1.0 has that of 1."""
         return None if isinstance(value, list) else self.states.get(value)
 
+
+_NUMBERS = ("scale", "offset", "min", "max", "deadband")
 
 _KEYS = {UnknownOrder: "order", UnknownEncoding: "encoding"}
 """The keys that errors of conversions are about; all others are about the type."""
