@@ -146,6 +146,7 @@ def test_the_asynchronous_client_takes_them(server: holdfast.Server) -> None:
         (numpy.int8(-1), "int32", [65535, 65535]),
         (numpy.uint8(12), "bcd16", [0x12]),
         (numpy.float32(1.5), "float32", [0x3FC0, 0]),
+        (numpy.int64(2**60 + 2**36 + 1), "float32", [0x5D80, 1]),
         (numpy.array([True, False]), "bool[2]", [1, 0]),
         (numpy.array([1, 2], "i8"), "uint16[2]", [1, 2]),
     ],

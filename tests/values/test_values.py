@@ -694,6 +694,25 @@ def test_a_float_may_be_given_as_any_real_number() -> None:
     assert encode([Fraction(1, 2), 2, 0.5], "float16[3]") == encode([0.5, 2.0, 0.5], "float16[3]")
 
 
+@pytest.mark.parametrize(("name", "step"), [("float16", 2.0**-10), ("float32", 2.0**-23)])
+def test_a_number_with_more_digits_than_a_float_is_rounded_once(name: str, step: float) -> None:
+    middle, little = 1 + Fraction(step) / 2, Fraction(1, 2**60)
+    pairs: list[tuple[Fraction | int, float]] = [
+        (middle - little, 1.0),
+        (middle, 1.0),
+        (middle + little, 1 + step),
+    ]
+    if name == "float32":
+        pairs += [(int(2**60 * middle) + 1, 2**60 * (1 + step)), (int(2**60 * middle) - 1, 2.0**60)]
+        pairs.append((2**128 - 2**103 - 1, MAX_VALUE[name]))
+    for value, nearest in pairs:
+        for sign in (1, -1):
+            assert decode(encode(sign * value, name), name) == sign * nearest
+            assert decode(encode([0.5, sign * value], f"{name}[2]"), f"{name}[2]")[1] == (
+                sign * nearest
+            )
+
+
 def test_an_integer_may_be_of_any_library() -> None:
     class Integer:
         def __index__(self) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from abc import abstractmethod
-from math import isinf
+from math import inf, isinf, nextafter
 from numbers import Real
 from operator import not_
 from typing import TYPE_CHECKING, Any
@@ -45,8 +45,20 @@ def nearest_float(number: float, base: str) -> float:
     """The nearest number of a floating-point type. Raises `OverflowError` beyond the type."""
     form = f">{FLOATS[base]}"
     # Of an integer beyond the type, `struct` has an error of its own.
-    found: float = struct.unpack(form, struct.pack(form, float(number)))[0]
+    found: float = struct.unpack(form, struct.pack(form, _float_for(number, base)))[0]
     return found
+
+
+def _float_for(number: Any, base: str) -> float:
+    """The float that `struct` rounds to the nearest number of a type.
+
+    Rounded to 53 bits and then to fewer, a number can become the one that is second nearest. This
+    does not happen if the last of the 53 bits is 1 wherever they do not hold the number itself.
+    """
+    found = float(number)
+    if base == "float64" or found == number or struct.pack("<d", found)[0] % 2:
+        return found
+    return nextafter(found, inf if number > found else -inf)
 
 
 class Number(Kind):
@@ -76,12 +88,14 @@ class Number(Kind):
 
     def pack_one(self, value: Any) -> bytes:
         """The bytes of a number. Raises `DoesNotFit`."""
+        number = value
         try:
             if type(value) not in self.plain:
-                value = self._number(value)
-            data = self._one.pack(value)
+                number = self._number(value)
+            data = self._one.pack(number)
         except (struct.error, OverflowError):
-            raise _outside(value, self._least, self._most, self.name) from None
+            found = value if type(value) is int else number
+            raise _outside(found, self._least, self._most, self.name) from None
         return self._moved(data)
 
     def pack_many(self, values: Sequence[Any]) -> bytes:
@@ -122,10 +136,12 @@ class Float(Number):
     divisor or a switch.
     """
 
-    plain = frozenset({float, int})
+    plain = frozenset({float})
 
     def __init__(self, type: Type, order: Order) -> None:
         super().__init__(type, order, FLOATS[type.base])
+        if type.base == "float64":
+            self.plain |= {int}  # `struct` rounds them once.
 
     def pack_one(self, value: Any) -> bytes:
         """The bytes of a number. Raises `DoesNotFit`."""
@@ -144,7 +160,8 @@ class Float(Number):
     def _number(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, Real):
             raise DoesNotFit(f"{shown(value)} is not a number, which {self.name} requires")
-        number = float(value)
+        integer = as_integer(value)  # Those of NumPy are rounded to compare them with floats.
+        number = _float_for(value if integer is None else integer, self.name)
         # A float of numpy with more bits, which `float` does not refuse.
         if isinf(number) and value != number:
             raise OverflowError
