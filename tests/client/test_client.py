@@ -1586,8 +1586,12 @@ def test_a_client_that_was_closed_ends_without_a_warning(server: holdfast.Server
     run(main)
 
 
-def test_a_client_is_in_use_in_one_event_loop_only(server: holdfast.Server) -> None:
-    plc = holdfast.Client(url_of(server), timeout=wire.DEADLINE)
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp", "udp"])
+def test_a_client_is_in_use_in_one_event_loop_only(
+    kind: str, memory: holdfast.Memory, serve: Serve
+) -> None:
+    host, port = serve({1: memory}, bind=f"{kind}://127.0.0.1:0").address
+    plc = holdfast.Client(f"{kind}://{host}:{port}", timeout=wire.DEADLINE)
 
     async def read() -> list[int]:
         return await plc.read_holding_registers(0, 1)
@@ -1602,6 +1606,20 @@ def test_a_client_is_in_use_in_one_event_loop_only(server: holdfast.Server) -> N
         one.run(plc.close())
         assert other.run(read()) == [0]
         other.run(plc.close())
+
+
+def test_a_client_may_be_used_after_its_event_loop_was_closed(
+    memory: holdfast.Memory, serve: Serve
+) -> None:
+    host, port = serve({1: memory}, bind="udp://127.0.0.1:0").address
+    plc = holdfast.Client(f"udp://{host}:{port}", timeout=wire.DEADLINE)
+    assert asyncio.run(plc.read_coils(0, 1)) == [False]
+
+    async def main() -> None:
+        async with plc:
+            assert await plc.read_coils(0, 1) == [False]
+
+    run(main)
 
 
 def test_a_client_runs_in_uvloop(server: holdfast.Server) -> None:

@@ -77,9 +77,12 @@ class OwnTransport(AsyncTransport, Protocol):
 
 
 class ThreadedConnection:
-    """A transport with one request at a time, in a thread of its own."""
+    """A transport with one request at a time, in a thread of its own, and in one event loop at a
+    time."""
 
     _executor: ThreadPoolExecutor | None = None
+    _loop: asyncio.AbstractEventLoop | None = None
+    """The event loop that uses the thread."""
 
     def __init__(self, target: Target, trace: Trace | None = None) -> None:
         self._target = target
@@ -99,7 +102,11 @@ class ThreadedConnection:
         timeout: float,
         note_sent: Callable[[], None] | None = None,
     ) -> Any:
-        """Sends a request after the calls before it, and waits for the result."""
+        """Sends a request after the calls before it, and waits for the result.
+
+        Raises `RuntimeError` while the client is in use in another event loop.
+        """
+        loop = self._loop = self._here()
         if note_sent is not None:
             note_sent()  # The thread may send it at any time.
         if self._executor is None:
@@ -115,13 +122,14 @@ class ThreadedConnection:
             return core.call(request, unit, timeout, cancelled.is_set)
 
         try:
-            return await asyncio.get_running_loop().run_in_executor(self._executor, carry)
+            return await loop.run_in_executor(self._executor, carry)
         except asyncio.CancelledError:
             cancelled.set()
             raise
 
     async def close(self) -> None:
         """Closes the connection; the current call and waiting calls fail."""
+        self._here()
         executor = self._leave()
         if executor is not None:
             await asyncio.to_thread(self._end, executor)
@@ -131,6 +139,13 @@ class ThreadedConnection:
         executor = self._leave()
         if executor is not None:
             self._end(executor)
+
+    def _here(self) -> asyncio.AbstractEventLoop:
+        """This loop, which may use the connection."""
+        loop = asyncio.get_running_loop()
+        if self._executor is not None and self._loop is not loop:
+            _check_closed(self._loop)
+        return loop
 
     def _leave(self) -> ThreadPoolExecutor | None:
         """The thread, if there is one: calls that wait for it fail, and the next has a new one."""
@@ -281,8 +296,8 @@ class AsyncConnection:
         loop, last = asyncio.get_running_loop(), self._last
         if last is not None and last.loop is loop:
             return last
-        if last is not None and last.in_use and not last.loop.is_closed():
-            raise RuntimeError("the client is in use in another event loop: close it there")
+        if last is not None and last.in_use:
+            _check_closed(last.loop)
         # An object for each loop: calls that a closed loop has left behind may end at any time,
         # and must not give back places of the new one.
         late = (0, 0.0) if last is None else (last.late, last.longest_late)
@@ -599,6 +614,12 @@ class _Streamed(_Protocol, asyncio.Protocol):
     def __init__(self, here: _LoopConnection, core: Connection) -> None:
         super().__init__(here, core)
         self.data_received = core.data_received  # type: ignore[assignment, method-assign]
+
+
+def _check_closed(loop: asyncio.AbstractEventLoop | None) -> None:
+    """Raises `RuntimeError` unless the loop that has used a client is closed."""
+    if loop is not None and not loop.is_closed():
+        raise RuntimeError("the client is in use in another event loop: close it there")
 
 
 def _closed_before_sent() -> ConnectionLost:
