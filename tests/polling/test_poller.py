@@ -308,6 +308,16 @@ def test_wrong_arguments_are_refused(
     assert poller.counters() == {}
 
 
+@pytest.mark.parametrize(
+    ("gather", "error"),
+    [(-1, ValueError), (float("nan"), ValueError), (1e9, ValueError), ("x", TypeError)],
+)
+def test_a_wait_that_is_no_time_is_refused(gather: Any, error: type[Exception]) -> None:
+    with pytest.raises(error, match=r"^gather is .*, allowed: 0 to 86400 seconds"):
+        Poller(gather=gather)
+    Poller(gather=0).close()
+
+
 @pytest.mark.parametrize("interval", ["1", None])
 def test_an_interval_is_a_number(poller: Poller, interval: Any) -> None:
     with pytest.raises(TypeError, match=f"interval is {interval!r}, allowed: 0.01 to"):

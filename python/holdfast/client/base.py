@@ -74,7 +74,7 @@ def checked_seconds(name: str, seconds: float, most: float, least: float | None 
     lower = "more than 0, up" if least is None else f"{least}"
     refusal = f"{name} is {seconds!r}, allowed: {lower} to {most:.0f} seconds"
     try:
-        is_allowed = 0 < seconds <= most and (least is None or least <= seconds)
+        is_allowed = (seconds > 0 if least is None else seconds >= least) and seconds <= most
     except TypeError:
         raise TypeError(refusal) from None
     if not is_allowed:

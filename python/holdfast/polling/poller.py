@@ -67,12 +67,14 @@ class Poller:
     Iterate over it from one thread or one task. `gather` is how many seconds a batch waits for the
     polls of other devices, after its first. If nobody takes batches, the oldest polls are dropped
     and counted.
+
+    Raises `ValueError` or `TypeError` for a `gather` that is no time.
     """
 
     def __init__(self, *, gather: float = 0.01) -> None:
+        self._gather = checked_seconds("gather", gather, MAX_TIMEOUT_S, 0)
         self._poller = _core.Poller([])
         self._results = self._poller.receiver()
-        self._gather = gather
         self._readers: dict[str, Reader] = {}
         """By the name in the core, see `_core_names`."""
         self._core_names: dict[str, str] = {}

@@ -28,7 +28,8 @@ class ServerOptions(TypedDict, total=False):
     frame_timeout: float
     """RTU over TCP: the time without a byte after which an incomplete request is discarded."""
     keepalive: int
-    """The time without a byte after which TCP asks whether the peer is still there."""
+    """The time without a byte after which TCP asks whether the peer is still there. Whole seconds,
+    1 to 32767."""
     listen_only: bool
     """Function 8 may set a unit to listen only mode, for all peers."""
     event_log: bool

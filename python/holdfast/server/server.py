@@ -5,7 +5,17 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable, Mapping
 from operator import index
-from typing import TYPE_CHECKING, Literal, Self, TypeAlias, TypeVar, Unpack, cast
+from typing import (
+    TYPE_CHECKING,
+    Literal,
+    Self,
+    SupportsFloat,
+    SupportsIndex,
+    TypeAlias,
+    TypeVar,
+    Unpack,
+    cast,
+)
 from urllib.parse import urlsplit
 
 from holdfast import _core
@@ -18,7 +28,7 @@ from holdfast.server.fork import close_in_children
 from holdfast.server.identity import Identity
 from holdfast.server.options import DEFAULTS, STREAM_DEFAULTS
 from holdfast.types import TRANSPORTS
-from holdfast.values.integers import as_integer
+from holdfast.values.integers import as_boolean, as_integer
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -217,7 +227,9 @@ def _listener(bind: str, rules: Sequence[Rule], options: ServerOptions) -> _core
 
 
 def _check(scheme: str, options: ServerOptions) -> None:
-    """Raises `ValueError` for an option that is set and has no effect with this scheme."""
+    """Raises `ValueError` for an option that is set and has no effect with this scheme, `TypeError`
+    for an unknown one and for a value of another type.
+    """
     if scheme in SERIAL:
         allowed = {"event_log"}
     elif scheme in _DATAGRAMS:
@@ -230,6 +242,25 @@ def _check(scheme: str, options: ServerOptions) -> None:
             raise TypeError(f"found the option {name!r}, allowed: {', '.join(DEFAULTS)}")
         if name not in allowed and value != cast("dict[str, object]", DEFAULTS)[name]:
             raise ValueError(f"{name} has no effect with {scheme}: omit it")
+        if (allowed_type := _other_type(name, value)) is not None:
+            raise TypeError(f"{name} is {value!r}, allowed: {allowed_type}")
+
+
+def _other_type(name: str, value: object) -> str | None:
+    """The type of an option, if a value has another one. The core checks the value."""
+    default = cast("dict[str, object]", DEFAULTS)[name]
+    if value is default:
+        return None
+    if name == "tls":
+        return None if isinstance(value, _core.ServerTls) else "holdfast.ServerTls(cert_file=…)"
+    if isinstance(default, bool):
+        return None if as_boolean(value) is not None else "True, False"
+    if isinstance(default, float):
+        is_number = isinstance(value, SupportsFloat | SupportsIndex)
+        return None if is_number else "a number of seconds"
+    if isinstance(default, str):
+        return None if isinstance(value, str) else "refuse, evict"
+    return None if as_integer(value) is not None else "an integer"
 
 
 def _check_line(scheme: str, units: Collection[int], sources: Sequence[str]) -> None:
