@@ -15,6 +15,7 @@ from holdfast.values import register_count
 from holdfast.values.orders import FOUR
 from holdfast.values.types import FIXED
 from support.paths import ROOT
+from support.wire import DEADLINE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -66,6 +67,33 @@ def test_decoded_values_have_the_type_that_is_promised() -> None:
     assert_type(bit, bool)
     found: list[object] = [number, count, bit]
     assert [type(value) for value in found] == [float, int, bool]
+
+
+class Index:
+    """An integer that has nothing but the method of `SupportsIndex`."""
+
+    def __init__(self, number: int) -> None:
+        self._number = number
+
+    def __index__(self) -> int:
+        return self._number
+
+
+def test_an_integer_needs_no_more_than_its_stub_promises(
+    memory: holdfast.Memory, server: holdfast.Server
+) -> None:
+    memory.write("holding_registers", 0, [Index(7), 8])
+    memory.write_many([("coils", 0, [Index(1)])])
+    with holdfast.SyncClient(f"tcp://127.0.0.1:{server.address[1]}", timeout=DEADLINE) as plc:
+        plc.write_register(2, Index(9))
+        plc.write_registers(3, [Index(65535)])
+        plc.write_coil(1, Index(1))
+        plc.write_coils(2, (Index(0), Index(1)))
+    assert memory.read("holding_registers", 0, 4) == [7, 8, 9, 65535]
+    assert memory.read("coils", 0, 4) == [1, 1, 0, 1]
+    for wrong in (65536, -1, 2**63, 2**200):
+        with pytest.raises((ValueError, TypeError), match="allowed: integers 0 to 65535"):
+            memory.write("holding_registers", 0, [Index(wrong)])
 
 
 def test_the_named_types_and_orders_are_all_there_are() -> None:

@@ -116,9 +116,6 @@ def test_values_that_change_while_they_are_read_write_nothing() -> None:
             values.clear()
             return 1
 
-        def __rshift__(self, _: int) -> int:
-            return 0
-
     values += [1, Clearing(), 1, 1]
     with pytest.raises(IndexError):
         Batch([(memory, "holding_registers", 0, values)]).write()
