@@ -205,7 +205,7 @@ def test_the_numbers_of_a_tag_are_plain() -> None:
         max=numpy.float64(1e9),
         deadband=numpy.float64(0.5),
         states={numpy.int64(0): "off", YES * TWO * 100: "on"},
-        null=[numpy.uint16(65535)],
+        null=frozenset([numpy.uint16(65535)]),
     )
     numbers = [tag.scale, tag.offset, tag.min, tag.max, tag.deadband, *tag.states, *tag.null]
     assert numbers == [100, -100, 0, 1e9, 0.5, 0, 200, 65535]
