@@ -356,6 +356,15 @@ def test_a_file_that_is_damaged_at_the_start_is_left_under_another_name(
     assert (tmp_path / "b.db.damaged").exists()
 
 
+def test_a_damaged_schema_need_not_be_utf_8(opened: Opened, tmp_path: Path) -> None:
+    file = tmp_path / "b.db"
+    opened(file).close()
+    file.write_bytes(file.read_bytes().replace(b"tabletags", b"table\x9fags"))
+    with pytest.raises(FileGone, match=r"b\.db: malformed .*; it is .*b\.db\.damaged now"):
+        opened(file)
+    assert opened(file).count == 0
+
+
 def test_a_file_that_is_damaged_near_its_end_is_sent_up_to_there(
     opened: Opened, tmp_path: Path
 ) -> None:

@@ -368,3 +368,12 @@ def test_a_database_that_is_broken_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "a.db").write_bytes(b"no database" * 1000)
     with pytest.raises(OSError, match=r"a\.db: file is not a database"):
         Database(settings(tmp_path / "a.db", "sqlite")).send(READINGS)
+
+
+def test_a_database_whose_damaged_schema_is_not_utf_8_is_an_error(tmp_path: Path) -> None:
+    file = tmp_path / "a.db"
+    with closing(sqlite3.connect(file)) as db:
+        db.execute("CREATE TABLE readings (time)")
+    file.write_bytes(file.read_bytes().replace(b"tablereadings", b"table\x9feadings"))
+    with pytest.raises(OSError, match=r"a\.db: malformed"):
+        Database(settings(file, "sqlite")).send(READINGS)

@@ -380,6 +380,9 @@ def file_errors(file: Path, undo: Callable[[], object] = lambda: None) -> Iterat
     except BaseException as error:
         with contextlib.suppress(sqlite3.Error):
             undo()
+        if isinstance(error, UnicodeDecodeError):
+            # Python failed to decode SQLite's message, which quotes damaged text of the schema.
+            error = _Damage(error.object.decode(errors="replace"))
         if isinstance(error, sqlite3.Error):
             raise OSError(f"{file}: {error}") from error
         raise
