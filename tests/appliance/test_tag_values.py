@@ -243,6 +243,26 @@ def test_values_in_a_file_that_a_reload_takes_away_are_logged(
     assert stored.count >= 4
 
 
+@pytest.mark.parametrize("is_removed", [False, True])
+def test_values_that_are_lost_at_the_end_of_an_output_are_logged(
+    tmp_path: Path, device: int, caplog: pytest.LogCaptureFixture, is_removed: bool
+) -> None:
+    """At a reload with other settings, the output goes on with what waits."""
+    made = settings(device)
+    made["outputs"]["down"] = {"type": "influx", "url": "http://127.0.0.1:9", "bucket": "b"}
+    with Appliance(load(saved(tmp_path, made))) as appliance:
+        status = appliance.diagnostics.adapter
+        wire.until(lambda: (status("output/down") or {}).get("waiting") == 4, "all wait")
+        made["outputs"]["down"]["bucket"] = "other"
+        if is_removed:
+            del made["outputs"]["down"]
+        appliance.reload(load(saved(tmp_path, made)))
+        logged = [each for each in caplog.records if each.message == "output_unsent"]
+        assert len(logged) == is_removed
+    [record] = [each for each in caplog.records if each.message == "output_unsent"]
+    assert vars(record)["fields"]["count"] >= 4
+
+
 def test_a_reload_changes_tags_and_outputs_and_loses_nothing(
     tmp_path: Path, device: int, memory: holdfast.Memory
 ) -> None:

@@ -437,8 +437,9 @@ def test_a_file_that_is_removed_in_an_outage_is_written_anew(
     again.end()
 
 
+@pytest.mark.parametrize(("is_followed", "lost"), [(False, 4), (True, 3)])
 def test_what_is_lost_with_a_folder_that_was_removed_is_told(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, is_followed: bool, lost: int
 ) -> None:
     folder = tmp_path / "removed"
     folder.mkdir()
@@ -449,9 +450,10 @@ def test_what_is_lost_with_a_folder_that_was_removed_is_told(
     folder.rename(tmp_path / "moved")
     wire.until(lambda: count(caplog, "output_file_failed") == 1, "it is logged")
     output.buffer.offer(polls(1, 3))
+    output.sending._is_followed = lambda: is_followed
     output.end()
     [record] = [record for record in caplog.records if record.message == "output_unsent"]
-    assert vars(record)["fields"]["count"] == 4
+    assert vars(record)["fields"]["count"] == lost
 
 
 def test_a_file_from_which_nothing_can_be_removed_stops_nothing(

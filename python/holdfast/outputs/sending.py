@@ -90,8 +90,9 @@ def soon_after(stop: Stop, end: Callable[[], None]) -> None:
 class Sending:
     """An adapter that sends what is in a buffer to a receiver.
 
-    At its end, `leaves_file` tells whether no output uses the file any more. `renew` offers the
-    last value of each tag again, or has the next ones of some tags of devices published.
+    At its end, `leaves_file` tells whether no output uses the file any more, and `is_followed`
+    whether the output goes on with other settings: it takes over what waits in memory. `renew`
+    offers the last value of each tag again, or has the next ones of some tags of devices published.
     """
 
     def __init__(
@@ -101,10 +102,12 @@ class Sending:
         buffer: Buffer,
         open_file: Callable[[], Stored] | None = None,
         leaves_file: Callable[[], bool] = bool,
+        is_followed: Callable[[], bool] = bool,
         renew: Callable[[Collection[tuple[str, str]] | None], object] = bool,
     ) -> None:
         self._name, self._receiver, self._buffer = name, receiver, buffer
-        self._open_file, self._leaves_file, self._renew = open_file, leaves_file, renew
+        self._open_file, self._renew = open_file, renew
+        self._leaves_file, self._is_followed = leaves_file, is_followed
         self._sent = self._refused = 0
         self._logged_dropped, self._logged_at = buffer.dropped, -inf
         self._looked_at = -inf
@@ -268,8 +271,9 @@ class Sending:
     def _log_unsent(self) -> None:
         """Logs what is lost."""
         stored = self._buffer.stored
-        kept = stored.count if stored is not None and stored.is_in_place else 0
-        unsent = len(self._buffer) - kept
+        in_file = 0 if stored is None else stored.count
+        kept = in_file if stored is not None and stored.is_in_place else 0
+        unsent = (in_file if self._is_followed() else len(self._buffer)) - kept
         if unsent > 0:
             log_lines.write(logging.WARNING, "output_unsent", output=self._name, count=unsent)
 

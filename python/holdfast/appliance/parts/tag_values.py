@@ -213,12 +213,16 @@ class TagValues:
         def leaves() -> bool:
             return all(each.settings.buffer.file != file for each in self._outputs.values())
 
+        def is_followed() -> bool:
+            return name in self._outputs and not self._ending.is_set()
+
         return Sending(
             name,
             receiver(),
             output.buffer,
             None if file is None else opened,
             leaves,
+            is_followed,
             # With `scan`, the next poll follows what was lost.
             partial(self.renew, name) if output.settings.publish == "change" else bool,
         )
