@@ -36,7 +36,6 @@ MESSAGE = re.compile(
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(copies, "RETRY_DELAY_S", 0.01)
-    monkeypatch.setattr(copies, "BACK_AFTER_S", 0.0)
 
 
 @pytest.fixture
@@ -163,18 +162,23 @@ def test_lines_wait_for_a_receiver_that_is_down(
         bound.bind(path)
         bound.settimeout(wire.DEADLINE)
         assert [record(bound.recv(65536))["number"] for _ in range(2)] == [1, 2]
-    await_counts(log, "syslog", sent=2, dropped=0, waiting=0)
-    wire.until(lambda: "audit_copies_back" in caplog.messages, "it is logged")
-    assert caplog.messages == ["audit_copy_failed", "audit_copies_back"]
+        await_counts(log, "syslog", sent=2, dropped=0, waiting=0)
+        outage = ["audit_copy_failed", "audit_copies_back"]
+        wire.until(lambda: caplog.messages == outage, "it is logged")
+    log.write(number=3)
+    wire.until(lambda: caplog.messages == [*outage, "audit_copy_failed"], "so is the next outage")
 
 
+@pytest.mark.parametrize(("back_after", "is_back"), [(3600.0, []), (0.0, ["audit_copies_back"])])
 def test_nobody_who_listens_over_udp_is_logged_once(
     udp: socket.socket,
     audit: Callable[..., Audit],
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
+    back_after: float,
+    is_back: list[str],
 ) -> None:
-    monkeypatch.setattr(copies, "BACK_AFTER_S", 3600.0)
+    monkeypatch.setattr(copies, "BACK_AFTER_S", back_after)
     caplog.set_level("INFO")
     address = udp.getsockname()
     udp.connect(("127.0.0.1", 9))  # It takes nothing from others, and nobody else gets its port.
@@ -182,7 +186,7 @@ def test_nobody_who_listens_over_udp_is_logged_once(
     log.write_all([{"number": number} for number in range(20)])
     await_counts(log, "syslog", waiting=0)
     assert counts(log, "syslog")["failed"] > 1
-    assert caplog.messages == ["audit_copy_failed"]
+    wire.until(lambda: caplog.messages == ["audit_copy_failed", *is_back], "it is logged")
 
 
 def test_lines_that_find_no_room_are_dropped_counted_and_logged(

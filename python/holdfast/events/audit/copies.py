@@ -26,8 +26,7 @@ RETRY_DELAY_S = 1.0
 """Seconds before a line is sent again."""
 
 BACK_AFTER_S = 5.0
-"""Seconds without a failure before an outage is over: over UDP, sends to a port where nobody
-listens succeed and fail by turns."""
+"""Seconds without a failure before an outage of a receiver that `reports_late` is over."""
 
 LOST_INTERVAL_S = 60.0
 """Interval of logging that lines were dropped."""
@@ -38,6 +37,10 @@ CLOSE_TIMEOUT_S = 2.0
 
 class Receiver(Protocol):
     """Where copies go."""
+
+    reports_late: bool
+    """Whether a line that does not arrive can be sent, and the next one fails, as over UDP: lines
+    to a port where nobody listens succeed and fail by turns."""
 
     def send(self, line: bytes) -> None:
         """Sends a line without its line feed. Raises `OSError`; the next call tries anew."""
@@ -132,6 +135,7 @@ class Copies:
             self._logged += too_long
             if (error is None or too_long) and self._waiting:
                 self._size -= len(self._waiting.popleft())
+            is_empty = not self._waiting
         if error is not None:
             # Each line that is lost, and each new reason of an outage.
             if too_long or str(error) != self._error:
@@ -139,10 +143,15 @@ class Copies:
             if not too_long:
                 self._error, self._failed_at = str(error), time.monotonic()
                 self._closed.wait(RETRY_DELAY_S)
-        elif self._error is not None and time.monotonic() >= self._failed_at + BACK_AFTER_S:
+        elif self._error is not None and is_empty and self._is_proven():
             self._error = None
             log_lines.write(logging.INFO, "audit_copies_back", receiver=self.name)
         self._log_lost(LOST_INTERVAL_S)
+
+    def _is_proven(self) -> bool:
+        """Whether a line that was sent shows that the receiver is up."""
+        late = BACK_AFTER_S if self._receiver.reports_late else 0.0
+        return time.monotonic() >= self._failed_at + late
 
     def _log_lost(self, every: float) -> None:
         """Logs how many lines were dropped, once in some seconds."""

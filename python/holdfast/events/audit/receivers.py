@@ -32,6 +32,7 @@ JOURNAL_FIELDS = b"SYSLOG_IDENTIFIER=holdfast-audit\nPRIORITY=5\nMESSAGE="
 class _SocketReceiver(ABC):
     """Connects with the first line, and again after an error."""
 
+    reports_late = False
     _socket: socket.socket | None = None
 
     def send(self, line: bytes) -> None:
@@ -73,6 +74,7 @@ class Syslog(_SocketReceiver):
     ) -> None:
         """`target`: host and port, or the path of a Unix socket."""
         self._transport = transport
+        self.reports_late = transport == "udp"
         self._target = target
 
     def _transmit(self, connection: socket.socket, line: bytes) -> None:
