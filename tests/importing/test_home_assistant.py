@@ -880,13 +880,14 @@ def test_secrets_are_not_shown_and_are_single_values(
     found = refusals(raised.value)
     assert len(found) == 2
     assert not [message for message in found if "hunter2" in message]
-    (tmp_path / "secrets.yaml").write_text("low: 0100\nother: 0200\n")
-    with pytest.raises(NotImportable) as raised:
-        imported("sensors: [{name: a, address: !secret low}]")
-    octal = "found the secret low, which the source read as octal"
-    assert refusals(raised.value) == [
-        f"8: modbus[0].sensors[0].address: {octal}, allowed: a number without a 0 in front"
-    ]
+    octal = "found the secret low, which the source read as octal or binary"
+    for low in ("0100", "0_100"):
+        (tmp_path / "secrets.yaml").write_text(f"low: {low}\nother: 0200\n")
+        with pytest.raises(NotImportable) as raised:
+            imported("sensors: [{name: a, address: !secret low}]")
+        assert refusals(raised.value) == [
+            f"8: modbus[0].sensors[0].address: {octal}, allowed: a number without a 0 in front"
+        ]
     (tmp_path / "inside").mkdir()
     (tmp_path / "inside" / "secrets.yaml").write_text("low:\n")
     (tmp_path / "inside" / "a.yaml").write_text("{name: a, address: !secret low}\n")
@@ -1083,6 +1084,11 @@ def test_an_octal_number_is_refused(imported: Callable[..., Imported], above: st
     for address in ("0100", "&x 0100", "!!int &x 0100"):
         with pytest.raises(NotImportable, match=r"found 0100, .* as octal, allowed: 64"):
             imported(f"sensors: [{{name: a, address: {address}}}]", hub)
+    for number, told in (("0_100", "octal, allowed: 64"), ("-0b_11", "binary, allowed: -3")):
+        with pytest.raises(NotImportable, match=f"found {number}, .* as {told}$"):
+            imported(f"sensors: [{{name: a, address: 1, nan_value: {number}}}]", hub)
+    quoted = imported("sensors: [{name: a, slave: 1, address: '0_100'}]", hub)
+    assert tags(quoted)["a"]["address"] == 100
     with pytest.raises(ConfigError, match="line hidden, as it may contain a secret"):
         imported("password: a: hunter2", hub)
 

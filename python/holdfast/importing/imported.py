@@ -24,8 +24,11 @@ ORDINALS: dict[Generation, str] = {1: "first", 2: "second"}
 _BREAK = re.compile(r"\r\n|\r|\n")
 """What ends a line of YAML; `splitlines` also takes U+2028, of which YAML counts none."""
 
-_OCTAL = re.compile(r"(?:[&!]\S*[ \t]+)*([-+]?0[0-7]+)(?![0-9A-Za-z_.:-])", re.ASCII)
-"""An octal number of YAML 1.1, behind its anchor and tag, where the place of a value is."""
+_OTHER_BASE = re.compile(
+    r"(?:[&!]\S*[ \t]+)*([-+]?0(?:b_*[01][01_]*|[0-7_]+))(?![0-9A-Za-z_.:-])", re.ASCII
+)
+"""An octal or binary number of YAML 1.1, behind its anchor and tag, where the place of a value
+is."""
 
 _SECRET = re.compile(r"(token|password|broker)[\"']?\s*:")
 
@@ -70,13 +73,14 @@ class Source:
     def __init__(self, path: Path | str, resolve: Resolve | None = None) -> None:
         """Raises `ConfigError` for a file that can't be read.
 
-        `resolve` gives tags of the source a value; such a source also accepted merge keys, and
-        took the last of equal keys.
+        `resolve` gives tags of the source a value; such a source also accepted merge keys and
+        numbers with underscores, and took the last of equal keys.
         """
         self.file = str(path)
         text = yaml_document.read_text(Path(path), self.file)
         self._lines = {self.file: _BREAK.split(text)}
         """The lines of each file."""
+        self._has_underscores = resolve is not None
 
         def known(kind: str, text: str, file: str) -> Any:
             assert resolve is not None, "only with it are tags given a value"
@@ -119,7 +123,7 @@ class Source:
 
     def _look_at(self, path: KeyPath, value: object) -> None:
         self.desk.broken = {each.key for each in self.problems}
-        self._refuse_octal(path, value)
+        self._refuse_other_bases(path, value)
         for repeated, line in self.desk.document.repeated:
             if all(one == other for one, other in zip(path, repeated, strict=False)):
                 message = f"line {line} has it, too: the last counts, as in the source"
@@ -133,18 +137,24 @@ class Source:
             self.desk.problem((), f"found {found}, allowed: a mapping")
         return isinstance(data, dict)
 
-    def _refuse_octal(self, path: KeyPath, value: object) -> None:
-        """Adds a problem for each integer that is octal for the source, but not here."""
+    def _refuse_other_bases(self, path: KeyPath, value: object) -> None:
+        """Adds a problem for each integer that is octal or binary for the source, but not here."""
         if isinstance(value, dict | list):
             inside = value.items() if isinstance(value, dict) else enumerate(value)
             for key, each in inside:
-                self._refuse_octal((*path, key), each)
-        elif type(value) is int:
+                self._refuse_other_bases((*path, key), each)
+        elif type(value) is int or (self._has_underscores and isinstance(value, str)):
             place = self.desk.document.place(path)
-            written = _OCTAL.match(self._line(place.file, place.line), place.column - 1)
-            if written is not None and (octal := int(written[1], 8)) != value:
-                message = f"found {written[1]}, which the source read as octal, allowed: {octal}"
-                self.desk.problem(path, f"{message}, or {value} if that is meant")
+            found = _OTHER_BASE.match(self._line(place.file, place.line), place.column - 1)
+            # With underscores, it is text here, and numbers are also read from text.
+            if found is None or (isinstance(value, str) and value != found[1]):
+                return
+            digits = found[1].replace("_", "")
+            base, name = (2, "binary") if "b" in digits else (8, "octal")
+            if (number := int(digits, base)) != value:
+                message = f"found {found[1]}, which the source read as {name}, allowed: {number}"
+                meant = f", or {value} if that is meant" if type(value) is int else ""
+                self.desk.problem(path, f"{message}{meant}")
 
     def _without_secrets(self, problems: Iterable[Problem]) -> list[Problem]:
         """Hides what a YAML error quotes from a line that may contain a secret."""

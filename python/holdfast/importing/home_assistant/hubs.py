@@ -218,8 +218,8 @@ def _secret_of(desk: Desk, name: str) -> Any:
     if found is None or isinstance(found, dict | list):
         raise ValueError(f"found the secret {name} without a value, allowed: text or a number")
     if desk.document.spell((name,)) in {problem.key for problem in desk.report.problems}:
-        allowed = "allowed: a number without a 0 in front"
-        raise ValueError(f"found the secret {name}, which the source read as octal, {allowed}")
+        base = "which the source read as octal or binary"
+        raise ValueError(f"found the secret {name}, {base}, allowed: a number without a 0 in front")
     return Secret(found) if isinstance(found, str) else found
 
 
