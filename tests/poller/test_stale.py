@@ -347,13 +347,14 @@ def test_ages_survive_a_reload_that_does_not_change_where_values_come_from(
         assert asked() is None
 
 
+@pytest.mark.parametrize("writes", ["refuse", "pass"])
 def test_the_ranges_of_a_device_that_a_reload_disables_are_stale_at_once(
-    tmp_path: Path, meter: Meter
+    tmp_path: Path, meter: Meter, writes: str
 ) -> None:
     file = tmp_path / "appliance.yaml"
 
     def loaded(**more: Any) -> Any:
-        file.write_text(config(meter, NEVER, writes="pass", **more))
+        file.write_text(config(meter, NEVER, writes=writes, **more))
         return load(file)
 
     with Appliance(loaded()) as appliance, client(appliance) as plc:
