@@ -16,6 +16,7 @@ from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.net.nats.connection import Servers
+from holdfast.replication.leases.bucket import Outdated
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.scanner.fleet import reports
 from holdfast.scanner.fleet.agreement import FleetRefused
@@ -381,6 +382,43 @@ def test_commands_stay_in_order_when_reads_overtake_each_other(
     monkeypatch.setattr(member_of(running.scanner).desired, "read", read)
     running.do(write_both())
     assert [value for _, value in judge.writes] == [5, 6]
+
+
+@pytest.mark.parametrize(
+    ("is_answered", "expected"),
+    [
+        (True, f"not stored in {WANTS}: an earlier change of d0 is not confirmed yet by a majority"),
+        (False, f"not stored: {WANTS} can't be read: timeout"),
+    ],
+)
+def test_a_change_that_is_not_stored_without_a_majority_is_refused_for_that_reason(
+    node: Callable[..., Running],
+    caller: Caller,
+    judges: Judges,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    is_answered: bool,
+    expected: str,
+) -> None:
+    running = node("a")
+    share(running)
+    [judge, *_] = judges.devices
+    desired = member_of(running.scanner).desired
+
+    async def store(device: str, *_: object) -> int:
+        raise Outdated(device)
+
+    async def read(_: str) -> None:
+        if not is_answered:
+            raise NoAnswer
+
+    with monkeypatch.context() as patched:
+        patched.setattr(desired, "store", store)
+        patched.setattr(desired, "read", read)
+        error = caller.request("modbus.subscribe", wanted(judge))["error"]
+    assert error.startswith(expected), error
+    assert devices_of(running) == {}
+    assert caller.request("modbus.subscribe", wanted(judge))["success"]
 
 
 def test_a_command_is_refused_while_subscriptions_cant_be_read(

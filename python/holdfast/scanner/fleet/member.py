@@ -217,13 +217,17 @@ class FleetMember(Placement):
         """Carries out the latest change of a device. Raises `Refused` if it can't be read."""
         # Under the lock: reads may overtake each other, and commands must stay in order.
         async with self._device_host.lock(device):
-            try:
-                await self.desired.read(device)
-            except (Error, OSError) as error:
-                self._has_new_client.set()  # The bucket may be lost.
-                flaw = f"{self.desired.bucket} can't be read: {nats_reason(error)}"
-                raise Refused(f"not written: {flaw}") from None
+            await self._read_newer(device, "not written")
             await self._adopt_locked(device)
+
+    async def _read_newer(self, device: str, outcome: str) -> None:
+        """Reads the latest change of a device. Raises `Refused` with the outcome if it can't."""
+        try:
+            await self.desired.read(device)
+        except (Error, OSError) as error:
+            self._has_new_client.set()  # The bucket may be lost.
+            flaw = f"{self.desired.bucket} can't be read: {nats_reason(error)}"
+            raise Refused(f"{outcome}: {flaw}") from None
 
     async def _adopt_now(self, device: str) -> Refused | None:
         """Returns why it is refused here. Then this node does not know the device any more."""
@@ -265,6 +269,7 @@ class FleetMember(Placement):
         """Makes a change of the subscriptions of a device, here and in the bucket."""
         # The change is made here first: it may be refused. If another node was faster, its value is
         # adopted, which undoes the change, and the change is made again on top of it.
+        was_changed = False
         for _ in range(MAX_STORE_ATTEMPTS):
             changed = await change()
             now = int(time.time() * 1000)
@@ -280,10 +285,13 @@ class FleetMember(Placement):
                 revision = self._applied.get(device, 0)
                 self._applied[device] = await self.desired.store(device, desired, revision)
             except Outdated:
-                with contextlib.suppress(Error, OSError):
-                    await self.desired.read(device)
-                if (refused := await self._adopt_now(device)) is not None:
+                try:
+                    await self._read_newer(device, "not stored")
+                finally:
+                    refused = await self._adopt_now(device)
+                if refused is not None:
                     raise Refused(f"the fleet's subscriptions of {device}: {refused}") from None
+                was_changed = self.desired.revision(device) > revision
                 continue
             except Refused:
                 await self._adopt_now(device)
@@ -297,6 +305,13 @@ class FleetMember(Placement):
                 raise NotConfirmed(f"not confirmed by {self.desired.bucket}: {reason}") from None
             self._note_renewed(device, renewed)
             return changed
+        if not was_changed:
+            # The server that refuses it has another change, which can't be read before a majority
+            # of the servers has it.
+            raise Refused(
+                f"not stored in {self.desired.bucket}: an earlier change of {device} is not "
+                "confirmed yet by a majority of the servers: try again"
+            )
         raise Refused(
             f"{device} was changed by other nodes {MAX_STORE_ATTEMPTS} times meanwhile: try again"
         )
