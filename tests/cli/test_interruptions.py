@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
+HANGUP = getattr(signal, "SIGHUP", signal.SIGTERM)
+
+
 def test_a_signal_ends_a_search_after_what_must_not_be_cut() -> None:
     done: list[str] = []
 
@@ -138,14 +141,19 @@ def test_a_write_that_is_interrupted_was_possibly_carried_out(
 
 @pytest.fixture
 def heard() -> Iterator[None]:
-    """Ctrl-C counts, also if the tests run in the background of a shell, which ignores it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Signals count, also if the tests run in the background of a shell, or under nohup."""
+    usual: dict[signal.Signals, Any] = {
+        signal.SIGINT: signal.default_int_handler,
+        HANGUP: signal.SIG_DFL,
+    }
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
     yield
-    signal.signal(signal.SIGINT, before)
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.mark.usefixtures("heard")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", list(dict.fromkeys([signal.SIGINT, signal.SIGTERM, HANGUP])))
 def test_what_was_written_is_told_if_reading_it_back_is_interrupted(
     tmp_path: Path, number: signal.Signals
 ) -> None:

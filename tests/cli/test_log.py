@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import signal
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -144,6 +145,7 @@ def test_what_can_not_be_restored_is_told_and_changes_nothing(tmp_path: Path) ->
         assert "backup: File exists" in failed("backup", file, backup)
         told = failed("restore", file, backup)
         assert "the servers already have KV_holdfast-log-site, OBJ_holdfast-log-site, " in told
+        assert "if a restore was cut short, delete these streams" in told
         write(appliance, 1, 8)
     other = configuration(tmp_path, "other", "line")
     assert "a backup of the log site, not of line" in failed("restore", other, backup)
@@ -172,6 +174,66 @@ def test_a_part_that_a_server_refuses_leaves_nothing_behind(tmp_path: Path) -> N
         with Appliance(load(file)) as appliance:
             assert register(appliance, 1) == 7
     finally:
+        server.kill()
+
+
+def streams(server: NatsServer) -> list[str]:
+    async def found() -> list[str]:
+        client = await nats.connect(server.url)
+        names = [each.config.name or "" for each in await client.jetstream().streams_info()]
+        await client.close()
+        return names
+
+    return asyncio.run(found())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGHUP")
+def test_no_node_begins_with_a_restore_that_was_cut_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, backup = configuration(tmp_path), tmp_path / "backup"
+    with Appliance(load(file)) as appliance:
+        write(appliance, 1, 7)
+    done("log", "backup", str(file), str(backup))
+    (tmp_path / "server").mkdir()
+    server = NatsServer(tmp_path / "server")
+    file = configuration(tmp_path, servers=[server.url])
+    send, delete, left = log_backup._send, log_backup._delete, list[str]()
+
+    async def send_most(client: Any, stream: str, *more: Any) -> None:
+        if stream.startswith("KV_"):
+            signal.raise_signal(number)
+            await asyncio.sleep(0)  # Ctrl-C ends it here.
+        await send(client, stream, *more)
+
+    async def note_and_delete(*arguments: Any) -> None:
+        left.extend(await asyncio.to_thread(streams, server))
+        await delete(*arguments)
+
+    # The tests may run in the background of a shell, or under nohup.
+    usual: dict[signal.Signals, Any] = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    try:
+        with monkeypatch.context() as patched:
+            patched.setattr(log_backup, "_send", send_most)
+            patched.setattr(log_backup, "_delete", note_and_delete)
+            for number in usual:  # noqa: B007 - `send_most` raises it.
+                left.clear()
+                result = invoke("log", "restore", str(file), str(backup))
+                assert (result.exit_code, result.output) == (1, "holdfast: interrupted\n")
+                # What a process that was killed leaves: a log with messages and without the key,
+                # which nodes refuse.
+                assert sorted(left) == ["OBJ_holdfast-log-site", "holdfast-log-site"]
+                assert not streams(server)
+        done("log", "restore", str(file), str(backup))
+        assert "KV_holdfast-log-site" in streams(server)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
         server.kill()
 
 

@@ -387,7 +387,10 @@ def test_commands_stay_in_order_when_reads_overtake_each_other(
 @pytest.mark.parametrize(
     ("is_answered", "expected"),
     [
-        (True, f"not stored in {WANTS}: an earlier change of d0 is not confirmed yet by a majority"),
+        (
+            True,
+            f"not stored in {WANTS}: an earlier change of d0 is not confirmed yet by a majority",
+        ),
         (False, f"not stored: {WANTS} can't be read: timeout"),
     ],
 )

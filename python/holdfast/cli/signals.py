@@ -143,13 +143,16 @@ def interruptions() -> Iterator[Signals]:
 
 
 @contextmanager
-def sigterm_as_ctrl_c() -> Iterator[None]:
-    """Lets SIGTERM raise `KeyboardInterrupt`, as Ctrl-C does."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+def stops_as_ctrl_c() -> Iterator[None]:
+    """Lets SIGTERM and SIGHUP, unless `nohup` is used, raise `KeyboardInterrupt` as Ctrl-C does."""
+    numbers = {signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)}
+    numbers = numbers.intersection(ending_signals())
+    before = {number: signal.signal(number, signal.default_int_handler) for number in numbers}
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _has_terminal() -> bool:

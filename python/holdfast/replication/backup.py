@@ -20,7 +20,7 @@ from holdfast.net import event_loop
 from holdfast.net.nats.connection import connected_once, nats_reason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable, Coroutine, Iterable
     from pathlib import Path
     from typing import TypeVar
 
@@ -93,7 +93,7 @@ class _Snapshot(NamedTuple):
 
 
 def streams(log: str) -> list[str]:
-    """The streams of a log, the one with the steps last."""
+    """The streams of a log: the one with the key of the snapshot first, with the steps last."""
     name = f"holdfast-log-{log}"
     return [f"KV_{name}", f"OBJ_{name}", name]
 
@@ -126,11 +126,20 @@ def back_up(servers: Servers, log: str, folder: Path) -> int:
 def restore(servers: Servers, log: str, replicas: int, folder: Path) -> int:
     """Puts a backup on servers that don't have the log. Returns the number of messages.
 
-    No node may run. Raises `BackupFailed`. What was restored by then is deleted again, unless the
-    connection is lost.
+    No node may run. Raises `BackupFailed`. What was restored by then is deleted again, if the
+    servers can still be reached. If it is not, no node begins with it: the key of the snapshot,
+    without which a log with messages is refused, is restored last, and deleted first.
     """
     found = _checked(folder, log)
-    return _run(servers, lambda client: _restore(client, log, replicas, folder, found))
+    begun: list[str] = []
+    try:
+        return _run(servers, lambda client: _restore(client, log, replicas, folder, found, begun))
+    except BaseException:
+        if begun:
+            # Over a new connection: what ends a command may also end the tasks of the old one.
+            with contextlib.suppress(BackupFailed):  # What has failed before is the reason.
+                _run(servers, lambda client: _delete(client, reversed(begun)))
+        raise
 
 
 def set_replicas(servers: Servers, log: str, replicas: int) -> dict[str, tuple[int, int]]:
@@ -329,27 +338,35 @@ def _checked(folder: Path, log: str) -> dict[str, Any]:
 
 
 async def _restore(
-    client: SafeClient, log: str, replicas: int, folder: Path, contents: dict[str, Any]
+    client: SafeClient,
+    log: str,
+    replicas: int,
+    folder: Path,
+    contents: dict[str, Any],
+    begun: list[str],
 ) -> int:
+    """Adds to `begun` which streams are to be deleted if it fails, in order."""
     every = (*streams(log), *leases(log))
     there = [name for name in every if await _config(client, name) is not None]
     if there:
-        raise BackupFailed(f"the servers already have {', '.join(there)}")
-    done: list[str] = []
-    try:
-        for name in streams(log):
-            config = contents[name]["config"] | {"num_replicas": replicas}
-            request = {"config": config, "state": contents[name]["state"]}
-            answer = await _ask(client, f"STREAM.RESTORE.{name}", request)
-            # Only now: a stream that the servers have refused to restore may belong to a node.
-            done.append(name)
-            await _send(client, name, answer["deliver_subject"], folder / name, contents[name])
-    except BaseException:
-        for name in done:
-            with contextlib.suppress(Error):  # What has failed before is the reason.
-                await client.request(f"$JS.API.STREAM.DELETE.{name}", b"", timeout=ANSWER_TIMEOUT_S)
-        raise
+        raise BackupFailed(
+            f"the servers already have {', '.join(there)}: if a restore was cut short, delete "
+            "these streams, for example with nats stream rm, and restore again"
+        )
+    for name in reversed(streams(log)):
+        config = contents[name]["config"] | {"num_replicas": replicas}
+        request = {"config": config, "state": contents[name]["state"]}
+        answer = await _ask(client, f"STREAM.RESTORE.{name}", request)
+        # Only now: a stream that the servers have refused to restore may belong to a node.
+        begun.append(name)
+        await _send(client, name, answer["deliver_subject"], folder / name, contents[name])
     return int(contents[streams(log)[-1]]["state"]["messages"])
+
+
+async def _delete(client: SafeClient, names: Iterable[str]) -> None:
+    for name in names:
+        with contextlib.suppress(_NotFound):  # Its restore was not complete.
+            await _ask(client, f"STREAM.DELETE.{name}")
 
 
 async def _send(

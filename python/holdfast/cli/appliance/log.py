@@ -17,6 +17,7 @@ from holdfast.cli.configuration import load_or_exit
 from holdfast.cli.exit_codes import fail
 from holdfast.cli.options.logs import chosen_log, log_option
 from holdfast.cli.options.option import config_argument
+from holdfast.cli.signals import stops_as_ctrl_c
 from holdfast.net.nats_server import ServerUnusable
 from holdfast.replication import backup as log_backup
 
@@ -88,7 +89,7 @@ def _servers(file: Path, name: str | None) -> Iterator[tuple[str, SharedLogConfi
     found = chosen_log(config, name)
     settings = config.logs[found]
     try:
-        with log_servers.running(found, settings):
+        with stops_as_ctrl_c(), log_servers.running(found, settings):
             yield found, settings, nats_servers(settings)
     except (ServerUnusable, log_backup.BackupFailed) as error:
         fail(f"logs.{found}: {error}")

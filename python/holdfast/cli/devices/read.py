@@ -20,7 +20,7 @@ from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option
 from holdfast.cli.options.plc_addresses import modicon_hint, modicon_option
 from holdfast.cli.options.value_type import typed, typed_options
-from holdfast.cli.signals import sigterm_as_ctrl_c
+from holdfast.cli.signals import stops_as_ctrl_c
 from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
 from holdfast.cli.terminal_text import print_json
@@ -90,7 +90,7 @@ def read(
 
     Exit codes: 0 all values read, 1 some values not read, 2 wrong usage.
     """
-    click.get_current_context().with_resource(sigterm_as_ctrl_c())
+    click.get_current_context().with_resource(stops_as_ctrl_c())
     in_no_area = device_items.is_named(words) and not files.given
     of = (
         None

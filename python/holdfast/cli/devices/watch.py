@@ -23,7 +23,7 @@ from holdfast.cli.options.option import json_option, number_option, option, requ
 from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import checked_url, is_url
 from holdfast.cli.progress import bar
-from holdfast.cli.signals import sigterm_as_ctrl_c
+from holdfast.cli.signals import stops_as_ctrl_c
 from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
 from holdfast.cli.terminal_text import print_json
@@ -88,7 +88,7 @@ def watch(
 
     Exit codes: 0 ended by q, Ctrl-C or SIGTERM, 1 the first reading failed, 2 wrong usage.
     """
-    click.get_current_context().with_resource(sigterm_as_ctrl_c())
+    click.get_current_context().with_resource(stops_as_ctrl_c())
     if is_url(target) or files.config is not None:
         untyped = (None, "ABCD", None)
         of = tag_options.device_of(

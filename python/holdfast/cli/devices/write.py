@@ -20,7 +20,7 @@ from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import flag, json_option
 from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.value_type import typed, typed_options
-from holdfast.cli.signals import sigterm_as_ctrl_c
+from holdfast.cli.signals import stops_as_ctrl_c
 from holdfast.cli.tags import options as tag_options
 from holdfast.cli.tags.options import TagFiles
 from holdfast.cli.terminal_text import print_json
@@ -109,7 +109,7 @@ def write(
     Exit codes: 0 written, 1 not written, possibly not written or read back different, 2 wrong
     usage.
     """
-    click.get_current_context().with_resource(sigterm_as_ctrl_c())
+    click.get_current_context().with_resource(stops_as_ctrl_c())
     in_no_area = device_items.is_named(words)
     is_changed = kind is not None or order != "ABCD" or encoding is not None or split or modicon
     if is_changed and (files.given or in_no_area):

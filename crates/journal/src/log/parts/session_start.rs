@@ -54,7 +54,8 @@ async fn load(node: &mut Node, store: &Store, first: u64, last: u64) -> Result<(
     let pointer = node.run_with_expiry(store.pointer()).await??;
     let Some((revision, pointer)) = pointer else {
         if last > 0 {
-            let text = "the log has messages, but the key of its snapshot is missing";
+            let text = "the log has messages, but the key of its snapshot is missing: it was deleted, or a \
+                        restore was cut short";
             return Err(match lags(node, text.to_owned()) {
                 // The contents of this node need not differ from those of the log.
                 End::Fatal(_) => LogError::Snapshot(text.to_owned()).into(),
