@@ -674,7 +674,7 @@ impl Device {
                 self.state.counters.reads.add();
                 self.state.counters.values.add_many(u64::from(read.count));
             }
-            Err(_) => self.state.count_unstored(),
+            Err(_) => self.state.count_unstored(true),
         }
         if !read.forward {
             return;
@@ -686,7 +686,7 @@ impl Device {
         }
     }
 
-    /// Writes what was read from the device. This doesn't wait for the journal of a memory, because the other
+    /// Writes what was read from the device, or its status block. This doesn't wait for the journal of a memory, because the other
     /// devices of the thread would wait too: what the journal refuses is counted later. Calls `stored` once memory
     /// has the values.
     fn store(
@@ -699,10 +699,10 @@ impl Device {
         if !memory.has_journal() {
             return memory.write(access, write).map(|()| stored());
         }
-        let state = Arc::clone(&self.state);
+        let (state, is_read) = (Arc::clone(&self.state), matches!(access, Access::Mirror));
         let done = Box::new(move |outcome: Outcome| match outcome {
             Ok(_) => stored(),
-            Err(_) => state.count_unstored(),
+            Err(_) => state.count_unstored(is_read),
         });
         submit_under(self.settings.fence.as_ref(), memory, access, write, done)
     }
@@ -721,7 +721,7 @@ impl Device {
                 .write_by(to, |write| self.store(&to.memory, Access::Ingest, write, || ()))
                 .is_err()
         {
-            self.state.count_unstored();
+            self.state.count_unstored(false);
         }
         if without_lease {
             return;

@@ -125,13 +125,13 @@ impl DeviceState {
         }
     }
 
-    /// Counts a refusal of memory. The poll counts as failed, or the next one.
-    pub(super) fn count_unstored(&self) {
+    /// Counts a refusal of memory. If it is of a read, the poll counts as failed, or the next one.
+    pub(super) fn count_unstored(&self, is_read: bool) {
         self.counters.unstored.add();
-        self.unstored.store(true, Ordering::Relaxed);
+        self.unstored.fetch_or(is_read, Ordering::Relaxed);
     }
 
-    /// Whether a memory has refused something since the last call.
+    /// Whether a memory has refused a read since the last call.
     pub(super) fn take_unstored(&self) -> bool {
         self.unstored.swap(false, Ordering::Relaxed)
     }
@@ -151,6 +151,7 @@ impl DeviceState {
     pub(super) fn set_standby(&self, standby: bool) {
         if !standby {
             self.health.store(Health::Unknown.code(), Ordering::Relaxed);
+            self.take_unstored();
             self.times().error_since = Some(Instant::now());
         }
         self.standby.store(standby, Ordering::Relaxed);

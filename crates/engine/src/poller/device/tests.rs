@@ -1,10 +1,11 @@
 //! Tests a device in states that its checks normally exclude: it writes nothing wrong to memory,
 //! and reports an error.
 
-use std::sync::Weak;
+use std::sync::{Mutex, Weak};
 
 use holdfast_memory::{
-    Access, Done, Freshness, Journal, Layout, Memory, Mirrored, Read, Span, Step, Term,
+    Access, Done, Freshness, Journal, Layout, Memory, Mirrored, Read, Refusal, Refused, Span, Step,
+    Term,
 };
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
@@ -230,7 +231,7 @@ fn values_become_older_while_a_journal_is_slow() {
 }
 
 #[test]
-fn a_status_block_that_memory_refuses_is_counted_and_is_an_error() {
+fn a_status_block_that_memory_refuses_is_counted_and_fails_no_poll() {
     with_device(async |endpoint| {
         let memory = memory();
         for (slot, area) in [(1, AREA), (u16::MAX, AREA), (0, Area::InputRegisters)] {
@@ -241,13 +242,55 @@ fn a_status_block_that_memory_refuses_is_counted_and_is_an_error() {
             device.publish_status();
             assert_eq!(state.counters.unstored.get(), 1);
             device.poll(Instant::now()).await;
-            assert_eq!((state.health(), state.last_error()), (Health::Error, 0x8006));
-            // The read itself was stored. A later poll without a refusal is good.
+            assert_eq!((state.health(), state.last_error()), (Health::Ok, 0));
             assert_eq!(state.counters.reads.get(), 1);
-            device.poll(Instant::now()).await;
-            assert_eq!(state.health(), Health::Ok);
         }
         assert_eq!(registers(&memory)[8..], [0; 72]);
+    });
+}
+
+#[test]
+fn a_poll_is_in_error_for_a_late_refusal_of_its_own_lease_only() {
+    /// Answers when the test does.
+    #[derive(Default)]
+    struct Late(Mutex<Vec<Done>>);
+
+    impl std::fmt::Debug for Late {
+        fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+            formatter.write_str("Late")
+        }
+    }
+
+    impl Journal for Late {
+        fn submit(&self, _: Step, done: Done) {
+            self.0.lock().unwrap().push(done);
+        }
+    }
+
+    with_device(async |endpoint| {
+        let (journal, memory) = (Arc::new(Late::default()), memory());
+        memory.keep_in(Arc::clone(&journal) as Arc<dyn Journal>, 0);
+        let refuse = || {
+            for done in journal.0.lock().unwrap().drain(..) {
+                done(Err(Refused { index: 0, refusal: Refusal::Unavailable }));
+            }
+        };
+        let status = StatusSettings { memory: Arc::clone(&memory), block: block(AREA, 1) };
+        let settings = settings(endpoint, &memory, 0);
+        let (device, state, _) = device(DeviceSettings { status: Some(status), ..settings });
+        let polled = async || {
+            device.poll(Instant::now()).await;
+            state.health()
+        };
+        device.publish_status();
+        refuse();
+        assert_eq!((polled().await, state.counters.unstored.get()), (Health::Ok, 1));
+        refuse();
+        assert_eq!((polled().await, state.counters.unstored.get()), (Health::Error, 2));
+        refuse();
+        state.set_standby(true);
+        state.set_standby(false);
+        assert_eq!((polled().await, state.counters.unstored.get()), (Health::Ok, 3));
     });
 }
 
