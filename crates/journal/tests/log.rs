@@ -14,7 +14,7 @@ use holdfast_memory::{
     Span, Step, StepWrite, Tenure, Term, Write, write_across,
 };
 use nodes::process::{Answer, Process};
-use nodes::{Node, REGISTERS, Server, cluster, memory_of, until};
+use nodes::{Folder, Node, REGISTERS, Server, cluster, free_port, memory_of, until};
 
 fn step(address: u16, value: u16) -> Step {
     let write = StepWrite {
@@ -533,6 +533,32 @@ fn fill(server: &Server) {
     });
 }
 
+#[test]
+fn a_node_says_which_permission_it_lacks() {
+    for denied in ["holdfast.log.Site.steps", "$JS.API.STREAM.INFO.holdfast-log-Site"] {
+        let folder = Folder::new();
+        let file = folder.0.join("nats.conf");
+        let permissions = format!("{{publish: {{deny: {denied:?}}}}}");
+        let user = format!("{{user: a, password: b, permissions: {permissions}}}");
+        let text = format!("no_auth_user: a, authorization: {{users: [{user}]}}");
+        std::fs::write(&file, text).unwrap();
+        let options = ["-c".to_owned(), file.to_str().unwrap().to_owned()];
+        let server = Server::with(free_port(), &options);
+        let node = Node::new(&[&server], "a", |settings| settings.name = "Site".to_owned());
+        node.log.start().unwrap();
+        let said = format!("Permissions Violation for Publish to {denied:?}");
+        let mut events = Vec::new();
+        until("its log says so", || {
+            events.append(&mut node.log.take_events(Duration::ZERO));
+            events.iter().any(|event| {
+                matches!(event.name, "log_error" | "log_connect_failed")
+                    && event.fields.iter().any(|(_, reason)| reason.contains(&said))
+            })
+        });
+        assert!(node.status().last_error.unwrap().contains(&said));
+    }
+}
+
 /// The servers may only be cut off from those that have the log. And a new stream would hide that it is lost.
 #[test]
 fn a_node_that_runs_makes_no_stream_in_place_of_a_lost_one() {
@@ -557,6 +583,14 @@ fn a_node_that_runs_makes_no_stream_in_place_of_a_lost_one() {
     assert!(runtime.block_on(jetstream.get_stream("holdfast-log-site")).is_err());
 }
 
+fn delete_stream(server: &Server, name: &str) {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        async_nats::jetstream::new(client).delete_stream(name).await.unwrap();
+    });
+}
+
 /// Whoever may delete what the log keeps beside its steps can't make it unusable while a node runs.
 #[test]
 fn snapshots_are_stored_again_after_a_bucket_of_the_log_was_deleted() {
@@ -575,15 +609,28 @@ fn snapshots_are_stored_again_after_a_bucket_of_the_log_was_deleted() {
     };
     until_stored("a snapshot is stored");
     for bucket in ["KV_holdfast-log-site", "OBJ_holdfast-log-site", "KV_holdfast-log-site-leases"] {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-        runtime.block_on(async {
-            let client = async_nats::connect(server.url()).await.unwrap();
-            async_nats::jetstream::new(client).delete_stream(bucket).await.unwrap();
-        });
+        delete_stream(&server, bucket);
         until_stored(bucket);
         nodes[1].write_at_last(1, 7);
         let new = Node::started(&[&server], "c");
         assert_eq!(new.read(1), Ok(7), "{bucket}");
+    }
+}
+
+/// As after a restore that was cut short: it restores the key last.
+#[test]
+fn a_log_with_messages_and_without_the_key_of_its_snapshot_is_not_begun_anew() {
+    let server = Server::new();
+    let node = Node::started(&[&server], "a");
+    node.write(0, 42).unwrap();
+    drop(node);
+    for bucket in ["KV_holdfast-log-site", "OBJ_holdfast-log-site"] {
+        delete_stream(&server, bucket);
+        let node = Node::new(&[&server], "a", |settings| settings.max_cut_off = Duration::ZERO);
+        let error = node.try_start().unwrap_err();
+        assert_eq!(error.kind(), "snapshot");
+        assert!(error.to_string().ends_with("or a restore was cut short"), "{error}");
+        assert_eq!(node.read(0), Err(Refusal::Differs));
     }
 }
 

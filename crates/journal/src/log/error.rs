@@ -92,6 +92,14 @@ impl End {
         End::Lost(format!("{what}: only a new snapshot of a node that has applied them helps"))
     }
 
+    /// Adds what a server has said meanwhile.
+    pub(super) fn because(self, said: Option<&str>) -> End {
+        match (self, said) {
+            (End::Lost(reason), Some(said)) => End::Lost(format!("{reason}: {said}")),
+            (end, _) => end,
+        }
+    }
+
     pub(super) fn reason(self) -> String {
         match self {
             End::Stopped => "the log was stopped".to_owned(),

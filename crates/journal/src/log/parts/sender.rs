@@ -311,11 +311,13 @@ impl Sender {
     }
 
     /// Shows an error in the status, and as an event if it is new.
-    fn report(&mut self, reason: &str) {
-        self.refusal = Some(reason.to_owned());
-        if self.shared.view().last_error.as_deref() != Some(reason) {
+    pub(in crate::log) fn report(&mut self, reason: &str) {
+        let reported = Some(reason.to_owned());
+        // The session before may have ended for it.
+        let before = self.refusal.replace(reason.to_owned());
+        if before != reported && self.shared.view().last_error != reported {
             self.shared.event(Event::new("log_error", &[("reason", reason)]));
-            self.shared.update(|view| view.last_error = Some(reason.to_owned()));
+            self.shared.update(|view| view.last_error = reported);
         }
     }
 

@@ -20,6 +20,7 @@ use crate::log::parts::comparer::Replayed;
 use crate::log::parts::node::{CHECK_INTERVAL, Node};
 use crate::log::parts::sender::{Acknowledged, Publisher};
 use crate::log::parts::session_start::{join, lags};
+use crate::log::settings::Settings;
 use crate::log::state::{Applied, digest_of};
 use crate::log::status::{Event, Phase};
 use crate::log::stream::connection::{Connected, REQUEST_TIMEOUT, connect};
@@ -81,16 +82,26 @@ pub(in crate::log) async fn run(node: &mut Node) -> (End, bool) {
 }
 
 impl<'n> Session<'n> {
-    /// Connects, and loads a snapshot if that is needed.
     async fn open(node: &'n mut Node) -> Result<(Session<'n>, Sources), End> {
         let settings = Arc::clone(&node.settings);
         let name = format!("holdfast log {} {}", settings.name, settings.node);
         let connected = node.run_with_expiry(connect(&settings.servers, name)).await??;
+        let error = connected.error.clone();
+        let begun = Session::begin(node, &settings, connected).await;
+        begun.map_err(|end| end.because(error.borrow().as_deref()))
+    }
+
+    /// Loads a snapshot if that is needed, and follows the log.
+    async fn begin(
+        node: &'n mut Node,
+        settings: &Settings,
+        connected: Connected,
+    ) -> Result<(Session<'n>, Sources), End> {
         let store = open_store(node, &connected.client).await?;
         let from = join(node, &store).await?;
         mend_keys(node, &store).await?;
         let messages = Messages::new(&store, from);
-        let publisher = Publisher::new(connected.client.clone(), &settings);
+        let publisher = Publisher::new(connected.client.clone(), settings);
         let acks = node.run_with_expiry(publisher.acknowledgements()).await??;
         let watched = [SNAPSHOT_KEY.to_owned(), format!("{DIGEST_KEY_PREFIX}>")];
         let watch = node.run_with_expiry(store.keys.watch_many_with_history(watched)).await?;
@@ -114,6 +125,7 @@ impl<'n> Session<'n> {
         // Steps whose time is over are not sent again.
         self.node.sender.expire(Instant::now());
         self.announce().await?;
+        let mut server_error = connected.error.clone();
         let mut checks = tokio::time::interval(CHECK_INTERVAL);
         checks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let first = tokio::time::Instant::now() + REPLICAS_INTERVAL;
@@ -147,6 +159,11 @@ impl<'n> Session<'n> {
                     None => return Err(End::Lost("the watch of the keys has ended".to_owned())),
                 },
                 Some(report) = reports.recv() => self.reported(report).await?,
+                Ok(()) = server_error.changed() => {
+                    if let Some(error) = server_error.borrow_and_update().as_deref() {
+                        self.node.sender.report(error);
+                    }
+                }
                 end = connected.end() => {
                     // The message that has ended the connection comes next in the next session.
                     while let Some(Ok(received)) = messages.next_now() {

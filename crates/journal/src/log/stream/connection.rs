@@ -31,6 +31,9 @@ pub(in crate::log) struct Connected {
     pub(in crate::log) client: Client,
     pub(in crate::log) server: String,
     ended: watch::Receiver<Option<String>>,
+    /// The latest error that the server has reported without an end of the connection, such as a missing
+    /// permission. Requests only get no answer then.
+    pub(in crate::log) error: watch::Receiver<Option<String>>,
 }
 
 impl Connected {
@@ -52,6 +55,7 @@ pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<C
         addresses.push(address);
     }
     let (sender, ended) = watch::channel(None);
+    let (error_sender, error) = watch::channel(None);
     let was_connected = Arc::new(AtomicBool::new(false));
     let options = login(&servers.login).await?;
     let options = match &servers.tls {
@@ -91,6 +95,12 @@ pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<C
                 Event::Disconnected | Event::Closed => Some("the connection was lost".to_owned()),
                 // The next session finds another server before this one ends.
                 Event::LameDuckMode => Some("the server is about to stop".to_owned()),
+                Event::ServerError(error) => {
+                    let error = error.to_string();
+                    let text = error.strip_prefix("nats: ").unwrap_or(&error);
+                    error_sender.send_replace(Some(format!("the server reports: {text}")));
+                    None
+                }
                 _ => None,
             };
             if reason.is_some() {
@@ -102,7 +112,7 @@ pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<C
     was_connected.store(true, Ordering::Release);
     let info = client.server_info();
     let server = format!("{}:{}", info.host, info.port);
-    Ok(Connected { client, server, ended })
+    Ok(Connected { client, server, ended, error })
 }
 
 async fn login(login: &Login) -> Result<ConnectOptions, LogError> {
