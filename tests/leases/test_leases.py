@@ -70,10 +70,10 @@ class Node:
 
 
 @contextlib.asynccontextmanager
-async def running(server: NatsServer, name: str, times: LeaseTimes) -> AsyncIterator[Node]:
+async def running(url: str, name: str, times: LeaseTimes) -> AsyncIterator[Node]:
     """A node that disappears at the end of the block, without giving anything back."""
     node = Node(name, times)
-    broker = Broker(Servers((server.url,)), {}, node.connected, Ping())
+    broker = Broker(Servers((url,)), {}, node.connected, Ping())
     tasks = [asyncio.create_task(broker.run()), asyncio.create_task(node.leases.run())]
     try:
         yield node
@@ -106,8 +106,8 @@ def test_the_holder_keeps_its_lease_and_another_takes_it_when_it_is_gone(
     settled: NatsServer,
 ) -> None:
     async def work() -> None:
-        async with running(settled, "b", LASTING) as second:
-            async with running(settled, "a", LASTING) as first:
+        async with running(settled.url, "b", LASTING) as second:
+            async with running(settled.url, "a", LASTING) as first:
                 first.leases.want(["x"])
                 await until(lambda: first.leases.is_held("x"), "the first node has it")
                 second.leases.want(["x"])
@@ -133,8 +133,8 @@ def test_the_holder_keeps_its_lease_and_another_takes_it_when_it_is_gone(
 def test_a_lease_that_is_given_back_is_taken_at_once(settled: NatsServer) -> None:
     async def work() -> None:
         async with (
-            running(settled, "a", ENDLESS) as first,
-            running(settled, "b", ENDLESS) as second,
+            running(settled.url, "a", ENDLESS) as first,
+            running(settled.url, "b", ENDLESS) as second,
         ):
             first.leases.want(["x"])
             await until(lambda: first.leases.is_held("x"), "the first node has it")
@@ -163,7 +163,7 @@ def test_a_renewal_that_was_not_confirmed_is_found(
         return done
 
     async def work() -> None:
-        async with running(settled, "a", LASTING) as node:
+        async with running(settled.url, "a", LASTING) as node:
             node.leases.want(["x"])
             await until(lambda: lost, "a confirmation is lost")
             revision = node.leases.seen["x"].revision
@@ -176,7 +176,7 @@ def test_a_renewal_that_was_not_confirmed_is_found(
 
 def test_without_the_server_a_holder_stops_before_others_may_begin(settled: NatsServer) -> None:
     async def work() -> None:
-        async with running(settled, "a", SHORT) as node:
+        async with running(settled.url, "a", SHORT) as node:
             node.leases.want(["x"])
             await until(lambda: node.leases.is_held("x"), "it is held")
             fence = node.leases.fence("x")
@@ -194,8 +194,8 @@ def test_without_the_server_a_holder_stops_before_others_may_begin(settled: Nats
 def test_a_former_holder_changes_nothing(settled: NatsServer) -> None:
     async def work() -> None:
         async with (
-            running(settled, "a", LASTING) as first,
-            running(settled, "b", LASTING) as second,
+            running(settled.url, "a", LASTING) as first,
+            running(settled.url, "b", LASTING) as second,
         ):
             first.leases.want(["x"])
             await until(lambda: first.leases.is_held("x"), "the first node has it")
@@ -224,16 +224,43 @@ def test_a_former_holder_changes_nothing(settled: NatsServer) -> None:
     asyncio.run(work())
 
 
+def test_a_node_that_may_not_write_the_bucket_says_so(tmp_path: Path) -> None:
+    file, deny = tmp_path / "nats.conf", f"{{publish: {{deny: '$KV.{BUCKET}.>'}}}}"
+    user = f"{{user: a, password: a, permissions: {deny}}}"
+    users = f"[{user}, {{user: b, password: b}}]"
+    file.write_text(f"no_auth_user: a, authorization: {{users: {users}}}")
+    server = NatsServer(tmp_path, "-c", str(file))
+    allowed = server.url.replace("//", "//b:b@")
+    reason = f'Permissions Violation for Publish to "$KV.{BUCKET}.x"'
+
+    async def work() -> None:
+        async with running(server.url, "a", LASTING) as node:
+            node.leases.want(["x"])
+            await until(lambda: len(node.events) > 1, "it is refused")
+            # What others may write does not help it.
+            async with running(allowed, "b", LASTING) as other:
+                other.leases.want(["y"])
+                await until(lambda: node.leases.holder("y") is not None, "it sees another lease")
+            assert node.events == ["works", f"fails: {reason}"]
+            assert node.leases.reason == reason
+
+    try:
+        make_settled(allowed, BUCKET)
+        asyncio.run(work())
+    finally:
+        server.kill()
+
+
 def test_a_bucket_of_another_kind_is_named(server: NatsServer) -> None:
     async def work() -> None:
-        async with running(server, "b", SHORT) as node:
+        async with running(server.url, "b", SHORT) as node:
             await until(lambda: node.leases.reason is None, "the bucket is made")
             assert node.client is not None
             await node.client.jetstream().delete_stream(f"KV_{BUCKET}")
             await node.client.jetstream().add_stream(
                 name=f"KV_{BUCKET}", subjects=[f"$KV.{BUCKET}.>"]
             )
-        async with running(server, "a", SHORT) as node:
+        async with running(server.url, "a", SHORT) as node:
             node.leases.want(["x"])
             await until(lambda: "exists without TTLs" in str(node.leases.reason), "it says so")
             assert not node.leases.held
@@ -243,7 +270,7 @@ def test_a_bucket_of_another_kind_is_named(server: NatsServer) -> None:
 
 def test_a_bucket_that_was_deleted_is_made_again(settled: NatsServer) -> None:
     async def work() -> None:
-        async with running(settled, "a", SHORT) as node:
+        async with running(settled.url, "a", SHORT) as node:
             node.leases.want(["x"])
             await until(lambda: node.leases.is_held("x"), "it is held")
             assert node.client is not None
@@ -257,8 +284,8 @@ def test_a_bucket_that_was_deleted_is_made_again(settled: NatsServer) -> None:
 def test_nodes_agree_again_after_the_server_has_lost_its_storage(settled: NatsServer) -> None:
     async def work() -> None:
         async with (
-            running(settled, "a", LASTING) as first,
-            running(settled, "b", LASTING) as second,
+            running(settled.url, "a", LASTING) as first,
+            running(settled.url, "b", LASTING) as second,
         ):
             for node in (first, second):
                 node.leases.want(["x"])
@@ -289,13 +316,13 @@ def test_a_bucket_that_replaces_another_one_waits_for_leases_of_that_one(
     server: NatsServer,
 ) -> None:
     async def work() -> None:
-        async with running(server, "a", SHORT) as first:
+        async with running(server.url, "a", SHORT) as first:
             first.leases.want(["x"])
             await until(lambda: first.leases.is_held("x"), "it is held")
             assert first.client is not None
             await first.client.jetstream().delete_stream(f"KV_{BUCKET}")
             first.leases.want([])
-            async with running(server, "b", SHORT) as second:
+            async with running(server.url, "b", SHORT) as second:
                 were_open = []
                 second.watch = lambda: were_open.append(first.leases.fence("x").allows)
                 second.leases.want(["x"])
@@ -320,7 +347,7 @@ def test_a_lease_is_held_though_the_answer_was_lost(
         return done
 
     async def work() -> None:
-        async with running(settled, "a", ENDLESS) as node:
+        async with running(settled.url, "a", ENDLESS) as node:
             await until(lambda: SETTLED in node.leases.seen, "leases may be taken")
             node.leases.want(["x"])
             await until(lambda: lost, "an answer is lost")
@@ -337,7 +364,7 @@ def test_a_bucket_that_does_not_open_delays_no_renewal(
         await asyncio.Event().wait()
 
     async def work() -> None:
-        async with running(settled, "a", LASTING) as node:
+        async with running(settled.url, "a", LASTING) as node:
             node.leases.want(["x"])
             await until(lambda: node.leases.is_held("x"), "it is held")
             monkeypatch.setattr(LeaseBucket, "open", never)

@@ -133,7 +133,7 @@ def test_nothing_is_lost_when_the_server_is_away(
         (
             'authorization: {users: [{user: u, password: "", permissions: {publish: '
             '{deny: "modbus.data.big"}}}]}',
-            'permissions violation for publish to "modbus.data.big"',
+            'Permissions Violation for Publish to "modbus.data.big"',
         ),
         ("max_payload: 512", r"modbus.data.big: found \d+ bytes, the server takes 512"),
     ],
@@ -160,14 +160,14 @@ def test_a_value_that_the_server_does_not_take_is_refused_alone(
 def test_a_value_counts_once_and_its_state_is_published_again(tmp_path: Path) -> None:
     with denying(tmp_path, '["modbus.data.BIG.>", "modbus.status.BIG"]') as output:
         for _ in range(2):
-            with pytest.raises(Refused, match=r"publish to \"modbus\.status\.big\"") as caught:
+            with pytest.raises(Refused, match=r"Publish to \"modbus\.status\.BIG\"") as caught:
                 output.send([reading(1, device="BIG"), reading(2), reading(3)])
             assert len(caught.value.readings) == 1
 
 
 def test_a_refused_value_whose_tag_has_a_quote_counts(tmp_path: Path) -> None:
     with denying(tmp_path, '"modbus.data.pump.>"') as output:
-        with pytest.raises(Refused, match="publish to") as caught:
+        with pytest.raises(Refused, match="Publish to") as caught:
             output.send([reading(1, tag=tag('5"')), reading(2), reading(3, device="other")])
         assert len(caught.value.readings) == 2
 

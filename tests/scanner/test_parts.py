@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from holdfast.client.url import NetworkTarget
 from holdfast.net.nats import outbox as outboxes
+from holdfast.net.nats.connection import Broker, Ping, Servers
 from holdfast.net.nats.outbox import Outbox
 from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.scanner.commands import Commands
@@ -36,6 +37,7 @@ from holdfast.scanner.subscriptions.registry import Registry
 from holdfast.scanner.subscriptions.request_rules import ScannerLimits
 from holdfast.scanner.subscriptions.tag import Tag
 from holdfast.tags.decoding import Places, decoder
+from support.nats_bus import logged
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -385,6 +387,32 @@ def test_a_server_whose_answer_waits_behind_messages_is_not_given_up() -> None:
         return client._pings_outstanding
 
     assert asyncio.run(outstanding()) == 0
+
+
+def test_an_error_of_the_server_is_logged_once_and_as_it_is_spelled(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    reasons = [f'Permissions Violation for Publish to "$KV.{each}"' for each in "AAbb"]
+
+    async def receive() -> None:
+        client = SafeClient()
+        broker = Broker(Servers(), {}, lambda _: None, Ping())
+        broker.client = client
+
+        async def failed(error: Exception) -> None:
+            broker._note(client, error)
+
+        client._error_cb = failed
+        client.transport._io_reader = asyncio.StreamReader()
+        client.transport._io_reader.feed_data(
+            b"".join(b"-ERR '%b'\r\n" % r.encode() for r in reasons)
+        )
+        await client._ps.parse(await client.transport.read(1000))
+
+    asyncio.run(receive())
+    assert [each["reason"] for each in logged(caplog, "nats_error")] == [
+        f"nats: {each}" for each in reasons[1:3]
+    ]
 
 
 def test_messages_flow_in_order_while_they_are_taken() -> None:

@@ -368,7 +368,7 @@ def test_a_refused_publish_is_told_and_the_rest_works(
         status = caller.listen("modbus.status.plc1")
         assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
         status.until(lambda message: message["state"] == "online", "it is online")
-    until_logged(caplog, "nats_error", 'ermissions violation for publish to "modbus.data.plc1"')
+    until_logged(caplog, "nats_error", 'ermissions Violation for Publish to "modbus.data.plc1"')
     assert scanner.serves
 
 

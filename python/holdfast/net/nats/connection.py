@@ -40,7 +40,7 @@ MAX_PAUSE = 2.0
 """Seconds between attempts to connect. Each failure doubles the pause, up to the maximum."""
 
 LOG_INTERVAL_S = 600.0
-"""Seconds before a failure to connect with the same reason is logged again."""
+"""Seconds before an error, or a failure to connect, with the same reason is logged again."""
 
 MAX_PENDING_BYTES = 64 * 1024 * 1024
 """The limit of nats-py's send buffer in bytes. The outbox always stays below it."""
@@ -246,15 +246,15 @@ class Broker:
 
     def _note(self, client: Client, error: Exception) -> None:
         """Logs an error. Without a connection, the error is a failed attempt to connect."""
-        reason = failure_text(error)
-        if self.client is not None:
-            log_lines.refused("nats_error", kind="nats", reason=reason)
-            return
-        self._pause_s = client.options["reconnect_time_wait"] = self._backoff.failed()
-        now = time.monotonic()
+        reason, now = failure_text(error), time.monotonic()
+        if self.client is None:
+            self._pause_s = client.options["reconnect_time_wait"] = self._backoff.failed()
         if reason == self._logged_failure[0] and now - self._logged_failure[1] < LOG_INTERVAL_S:
             return
         self._logged_failure = (reason, now)
+        if self.client is not None:
+            log_lines.refused("nats_error", kind="nats", reason=reason)
+            return
         attempts = self._backoff.failures
         log_lines.write(logging.WARNING, "nats_connect_failed", reason=reason, attempts=attempts)
 

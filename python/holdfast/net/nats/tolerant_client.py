@@ -24,6 +24,7 @@ from nats.aio.client import DEFAULT_FLUSH_TIMEOUT, Client
 from nats.aio.msg import Msg
 from nats.aio.transport import TcpTransport
 from nats.errors import Error, ProtocolError
+from nats.protocol.parser import PERMISSIONS_ERR
 
 from holdfast.events import log_lines
 from holdfast.net.secure_channel import SecureChannel
@@ -44,6 +45,13 @@ CLOSE_TIMEOUT_S = 1.0
 
 MAX_LINE_BYTES = 1024 * 1024
 """The longest line of the protocol in bytes. INFO lines are the longest."""
+
+
+class ServerError(Error):
+    """An error that the server reports and after which the connection goes on.
+
+    It is that of a missing permission, with subjects as they are spelled.
+    """
 
 
 class _Head(NamedTuple):
@@ -82,6 +90,8 @@ class MessageTransport(TcpTransport):
         self._channel: SecureChannel | None = None
         self._early = b""
         """What was decrypted and is not read yet."""
+        self.errors: deque[str] = deque()
+        """The errors of the server that nats-py has not parsed yet: its parser changes the case."""
         self._pings: deque[tuple[float, bool]] = deque()
         """Times of pings without an answer, and whether the client does not know of them."""
         self.pinged = self.answered = -math.inf
@@ -112,6 +122,7 @@ class MessageTransport(TcpTransport):
         self._buffer.clear()
         self._head = None
         self._early = b""
+        self.errors.clear()
         self._pings.clear()
         await super().connect(uri, buffer_size, connect_timeout)
 
@@ -267,7 +278,9 @@ class MessageTransport(TcpTransport):
         elif word == b"INFO":
             return _info_line(_decoded(rest))
         elif word == b"-ERR":
-            return b"-ERR '%b'" % _error_text(rest) + END
+            text = _error_text(rest)
+            self.errors.append(text)
+            return b"-ERR '%b'" % text.encode() + END
         elif word != b"+OK":
             raise ProtocolError("nats: unknown protocol")
         return b""
@@ -315,10 +328,10 @@ def _info_line(info: dict[str, Any]) -> bytes:
     return b"INFO " + json.dumps(info).encode() + END
 
 
-def _error_text(rest: bytes) -> bytes:
+def _error_text(rest: bytes) -> str:
     """The reason of an error as nats-py requires it: not empty, and in UTF-8."""
     text = " ".join(rest.decode(errors="backslashreplace").split()).strip("'")
-    return text.encode() or b"no reason given"
+    return text or "no reason given"
 
 
 @dataclass
@@ -370,6 +383,14 @@ class SafeClient(Client):
         """Pings the server, unless a ping was sent at or after `since`."""
         if self.is_connected and self.transport.pinged < since:
             self.transport.ping()
+
+    async def _process_err(self, err_msg: str) -> None:
+        text = self.transport.errors.popleft()
+        if PERMISSIONS_ERR not in err_msg:
+            await super()._process_err(err_msg)
+            return
+        self._err = ServerError(f"nats: {text}")
+        await self._error_cb(self._err)
 
     def _heard(self) -> None:
         """Resets nats-py's count of unanswered pings.

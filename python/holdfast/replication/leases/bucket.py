@@ -26,6 +26,7 @@ from nats.js.api import (
 )
 from nats.js.errors import APIError, NoStreamResponseError, NotFoundError
 
+from holdfast.net.nats.tolerant_client import ServerError
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.runtime.malformed_json import MALFORMED_JSON
 
@@ -215,7 +216,8 @@ class KeyBucket:
         """Publishes a message, and waits for its answer.
 
         This is what `request` of nats-py does, for a fifth of its cost: a node renews hundreds of
-        leases every second.
+        leases every second. Raises `ServerError` if this node may not publish to the subject, and
+        `NoAnswer`.
         """
         async with self._opening:
             if self._inbox is None:
@@ -225,12 +227,17 @@ class KeyBucket:
         number = str(next(self._numbers))
         answered: asyncio.Future[Msg] = asyncio.get_running_loop().create_future()
         self._waiting[number] = answered
+        before = self.client.last_error
         try:
             reply = f"{self._inbox}.{number}"
             await self.client.publish(subject, value, reply=reply, headers=headers)
             async with asyncio.timeout(self._key_timeout_s):
                 return await answered
         except TimeoutError:
+            error = self.client.last_error
+            names_it = f'"{subject}"' in str(error)
+            if isinstance(error, ServerError) and error is not before and names_it:
+                raise error from None
             raise NoAnswer from None
         finally:
             del self._waiting[number]

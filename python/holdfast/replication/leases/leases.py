@@ -25,6 +25,7 @@ from nats.js.errors import APIError, NoStreamResponseError
 
 from holdfast import _core
 from holdfast.net.nats.connection import nats_reason
+from holdfast.net.nats.tolerant_client import ServerError
 from holdfast.replication.leases.bucket import (
     SETTLED,
     Entry,
@@ -134,8 +135,8 @@ class Leases:
         self.reason: str | None = "not connected"
         """Why the bucket does not work; `None` if it does."""
         self._is_opening = self._is_checked = self._is_settling = False
-        self._is_refused = False
-        """Whether JetStream has refused a write, and none was accepted since."""
+        self._refusal: Exception | None = None
+        """Why the last write was refused, if none was accepted since."""
         self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
         self._made_at: datetime | None = None
         self.may_settle_at = 0.0
@@ -301,7 +302,7 @@ class Leases:
         self._is_checked = True
         self._heard = time.monotonic()
         self._backoff.succeeded()
-        if not self._is_refused:
+        if self._refusal is None:
             self.works(None)
         self._news.set()
 
@@ -310,7 +311,7 @@ class Leases:
         if created != self._made_at or last_revision < self._latest:
             self._made_at = created
             self.seen.clear()
-            self.is_read = self._is_refused = False
+            self.is_read, self._refusal = False, None
             self.may_settle_at = time.monotonic() + self.times.settle_s
 
     @property
@@ -328,15 +329,15 @@ class Leases:
             self._watcher.works(reason)
 
     def _note_failure(self, error: Exception) -> None:
-        """Reports that JetStream refuses writes. A missing answer is not a refusal."""
-        if isinstance(error, APIError):
-            self._is_refused = True
+        """Reports that the server refuses writes. A missing answer is not a refusal."""
+        if isinstance(error, (APIError, ServerError)):
+            self._refusal = error
             self.works(nats_reason(error))
 
     def _note_write(self) -> None:
         """Notes that a write of this or another node was accepted."""
-        if self._is_refused:
-            self._is_refused = False
+        if self._refusal is not None:
+            self._refusal = None
             self.works(None)
 
     def _saw(self, key: str, entry: Entry) -> None:
@@ -345,7 +346,9 @@ class Leases:
         if before is not None and entry.revision <= before.revision:
             return
         self.seen[key] = entry
-        if entry.holding is not None or key == SETTLED:
+        # Only this node may lack a permission.
+        is_of_all = not isinstance(self._refusal, ServerError)
+        if is_of_all and (entry.holding is not None or key == SETTLED):
             self._note_write()
         was, now = (None if each is None else each.holding for each in (before, entry))
         same = was is not None and now is not None and was.process == now.process

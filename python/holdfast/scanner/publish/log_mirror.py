@@ -42,7 +42,7 @@ class LogMirror(logging.Handler):
         if record.thread != self._thread or self._refused:
             return
         text = log_lines.message(record)
-        if record.getMessage() == "nats_error" and self._subject.lower() in text.lower():
+        if record.getMessage() == "nats_error" and self._subject in text:
             self._refused = True  # Each further message would cause another error.
             return
         entry = LogEntry(

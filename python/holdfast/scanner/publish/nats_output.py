@@ -214,5 +214,5 @@ class NatsOutput(Receiver):
 
 
 def _as_reported(subject: str) -> str:
-    """A subject as in the error of the server, which quotes it, and of nats-py: in lower case."""
-    return json.dumps(subject, ensure_ascii=False)[1:-1].lower()
+    """A subject as in the error of the server, which quotes it."""
+    return json.dumps(subject, ensure_ascii=False)[1:-1]
