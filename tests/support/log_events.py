@@ -31,7 +31,6 @@ BY_VARIABLE = {
         "subscriptions_kept",
         "subscriptions_not_kept",
     },
-    "scanner/jetstream/restore.py": {"restored", "not_restored"},
     "scanner/polling/devices.py": {
         f"device_{state}" for state in ("connecting", "online", "offline")
     },

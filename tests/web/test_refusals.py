@@ -27,7 +27,7 @@ PACKAGE = ROOT / "python" / "holdfast"
 def raised(*rooms: str) -> set[str]:
     """The reasons that the source of some rooms names where it refuses."""
     files = [file for room in rooms for file in sorted((PACKAGE / room).rglob("*.py"))]
-    form = re.compile(r'\b(?:BadRequest|Declined|Refused)\(\s*"(\w+)"')
+    form = re.compile(r'\b(?:BadRequest|Declined|Refused|refusal)\(\s*"(\w+)"')
     return {reason for file in files for reason in form.findall(file.read_text())}
 
 

@@ -513,14 +513,14 @@ class MemoryAccess:
         target = self.memories.get(memory)
         if target is not None and memory in grant.memories and area in grant.areas:
             return target
-        reason, detail = "not_granted", f"area {area} is not granted to {grant.name}"
+        place = index, memory, area, address
         if target is None:
-            reason, detail = "unknown_memory", f"no memory {shown(memory)}"
-        elif memory not in grant.memories:
-            detail = f"memory {memory} is not granted to {grant.name}"
-        elif area not in AREAS:
-            reason, detail = "invalid_area", f"area is {shown(area)}, allowed: {', '.join(AREAS)}"
-        raise refusal(reason, detail, (index, memory, area, address))
+            raise refusal("unknown_memory", f"no memory {shown(memory)}", place)
+        if memory in grant.memories and area not in AREAS:
+            detail = f"area is {shown(area)}, allowed: {', '.join(AREAS)}"
+            raise refusal("invalid_area", detail, place)
+        what = f"area {area}" if memory in grant.memories else f"memory {memory}"
+        raise refusal("not_granted", f"{what} is not granted to {grant.name}", place)
 
     def _refused(
         self,

@@ -61,17 +61,6 @@ async def end(tasks: Iterable[asyncio.Task[Any]]) -> None:
                 task.exception()  # Marks it retrieved.
 
 
-async def until_first(works: Iterable[Coroutine[Any, Any, object]]) -> None:
-    """Runs all until one has ended, and ends the others. Raises its error, if it has one."""
-    running = [asyncio.create_task(work) for work in works]
-    try:
-        done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            task.result()
-    finally:
-        await end(running)
-
-
 async def within(seconds: float | None, step: Awaitable[object]) -> None:
     """Waits until a step is done, or these seconds have passed; `None`: without a limit."""
     with contextlib.suppress(TimeoutError):

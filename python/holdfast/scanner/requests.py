@@ -77,19 +77,22 @@ class RequestLog:
     def subscribed(self, subscription: Subscription) -> None:
         """Logs a subscription."""
         tags, rate = len(subscription.tags), subscription.rate
-        subscription.key.log(logging.INFO, "subscribed", tags=tags, scan_rate=rate)
+        fields = subscription.key.fields
+        log_lines.write(logging.INFO, "subscribed", **fields, tags=tags, scan_rate=rate)
 
     def tags_not_restored(
         self, subscription: Subscription, tags: Iterable[str], reason: str
     ) -> None:
         """Logs the tags without which a stored subscription is carried out."""
         shown = clip(", ".join(tags), MAX_LOGGED_IDS)
-        subscription.key.log(logging.WARNING, "tags_not_restored", tags=shown, reason=reason)
+        fields = subscription.key.fields
+        log_lines.write(logging.WARNING, "tags_not_restored", **fields, tags=shown, reason=reason)
 
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Logs the end of a subscription, or of some of its tags."""
         tags = "all" if request.ids is None else len(request.ids)
-        SubscriptionKey.of(request).log(logging.INFO, "unsubscribed", tags=tags)
+        fields = SubscriptionKey.of(request).fields
+        log_lines.write(logging.INFO, "unsubscribed", **fields, tags=tags)
 
 
 @dataclass(eq=False)
@@ -191,7 +194,7 @@ class Requests:
                 ttls.renew(subscription, RETRY_EXPIRY_S)
                 return
         if has_ended:
-            subscription.log(logging.INFO, "expired")
+            log_lines.write(logging.INFO, "expired", **subscription.fields)
 
     def is_entry(self, subscription: SubscriptionKey) -> bool:
         """Whether a subscription is from an entry of a bucket."""

@@ -186,12 +186,12 @@ class Scanner:
         try:
             await self._requests.restore(request)
         except Refused as refused:
-            owner.log(logging.WARNING, "not_restored", reason=str(refused))
+            log_lines.write(logging.WARNING, "not_restored", **owner.fields, reason=str(refused))
             self._devices.give_up(request.device_id, str(refused))
             if request.ttl is None:  # Else its subscriber repeats it.
                 self._requests.former.setdefault(owner, []).append(request)
         else:
-            owner.log(logging.INFO, "restored", tags=len(request.tags))
+            log_lines.write(logging.INFO, "restored", **owner.fields, tags=len(request.tags))
 
     def stored_requests(self) -> Iterator[SubscribeRequest]:
         """Yields requests that make the subscriptions, except those from entries of a bucket."""

@@ -122,7 +122,13 @@ class FleetMember(Placement):
                     self._adopt_changes(),
                     self._adopt_refused(),
                 )
-                await tasks.until_first(works)
+                running = [asyncio.create_task(work) for work in works]
+                try:
+                    done, _ = await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+                    for task in done:
+                        task.result()
+                finally:
+                    await tasks.end(running)
         finally:
             await self.fleet.stop()
 

@@ -116,9 +116,14 @@ class KeyWatch:
         while True:
             await self._has_new_client.wait()
             self._has_new_client.clear()
-            if self._client is not None:
-                works = (self._keep_following(self._client), self._has_new_client.wait())
-                await tasks.until_first(works)
+            if self._client is None:
+                continue
+            works = (self._keep_following(self._client), self._has_new_client.wait())
+            running = [asyncio.create_task(work) for work in works]
+            try:  # However following has ended: the next connection begins it again.
+                await asyncio.wait(running, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                await tasks.end(running)
 
     async def _keep_following(self, client: Client) -> None:
         while not client.is_closed:  # nats-py then replaces a cancellation by an error.

@@ -192,10 +192,12 @@ class StoredSubscriptions(Placement):
             except Refused as refused:
                 if owner not in self._logged:
                     self._logged.add(owner)
-                    owner.log(logging.WARNING, "not_restored", reason=str(refused))
+                    log_lines.write(
+                        logging.WARNING, "not_restored", **owner.fields, reason=str(refused)
+                    )
                     self._device_host.give_up(owner.device, str(refused))
                 continue
             if self._pending.get(owner) is found:
                 self._touch(owner)
                 tags = sum(len(request.tags) for request in found)
-                owner.log(logging.INFO, "restored", tags=tags)
+                log_lines.write(logging.INFO, "restored", **owner.fields, tags=tags)

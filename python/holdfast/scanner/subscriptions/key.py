@@ -1,11 +1,9 @@
-"""What identifies a subscription, and how the log names it."""
+"""What identifies a subscription."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
-
-from holdfast.events import log_lines
 
 if TYPE_CHECKING:
     from holdfast.scanner.messages.types import SubscribeRequest, UnsubscribeRequest
@@ -24,6 +22,7 @@ class SubscriptionKey:
         """Returns the subscription of a request."""
         return SubscriptionKey(request.device_id, request.subscriber_id)
 
-    def log(self, level: int, event: str, **more: object) -> None:
-        """Logs an event of the subscription."""
-        log_lines.write(level, event, device=self.device, subscriber=self.subscriber, **more)
+    @property
+    def fields(self) -> dict[str, str | None]:
+        """What log lines have of the subscription."""
+        return {"device": self.device, "subscriber": self.subscriber}
