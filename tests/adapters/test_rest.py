@@ -614,6 +614,19 @@ def test_a_token_writes_what_it_may_and_nothing_else(
     assert secured.refusals() == {"not_granted": 2}
 
 
+@pytest.mark.parametrize("path", [web.INGEST, "/api/v1/sessions/end"])
+def test_a_client_without_the_right_is_refused_without_reading_its_body(
+    secured: web.Service, path: str
+) -> None:
+    more = "Content-Type: application/json", f"Authorization: Bearer {READER}", "Content-Length: 9"
+    with wire.Connection(secured.address) as connection:
+        connection.send(web.head("POST", path, *more))
+        connection.finish()
+        [answer] = web.answers(connection.rest())
+    assert (answer.status, answer.json["reason"]) == (403, "not_granted")
+    assert secured.refusals() == {"not_granted": 1}
+
+
 @pytest.mark.parametrize(
     ("secret", "memory", "area", "status"),
     [

@@ -5,17 +5,27 @@ from __future__ import annotations
 import asyncio
 import socket
 import sys
-from contextlib import closing
+import threading
+from contextlib import ExitStack, closing
 from ipaddress import ip_network
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from holdfast._core import HttpServer
 from holdfast.events import log_lines
-from holdfast.net.http.host import ConnectionLimits, Host
+from holdfast.net.http.host import (
+    LARGE_BODIES_PER_ADDRESS,
+    LARGE_BODY_BYTES,
+    ConnectionLimits,
+    Host,
+)
 from holdfast.net.http.port import listen
 from holdfast.net.http.requests import Request, Response
 from support import web, wire
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine, Iterator
 
 
 def loop_of_a_handler() -> str:
@@ -97,3 +107,106 @@ def test_the_log_says_why_a_connection_can_not_be_accepted(
                 resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     assert faults[0]["message"] == "the system can't accept a connection"
     assert "Too many open files" in str(faults[0]["error"])
+
+
+class Reader:
+    """A handler that reads a body, and notes its path and the round of the event loop."""
+
+    def __init__(self) -> None:
+        self.begun: list[str] = []
+        self.read: list[tuple[str, int]] = []
+        self.resume = threading.Event()
+        self._round = 0
+        self._counting: asyncio.Task[None] | None = None
+
+    def __call__(self, request: Request) -> Response | Coroutine[Any, Any, Response]:
+        self._counting = self._counting or asyncio.create_task(self._count())
+        self.begun.append(request.path)
+        if request.path == "/block":
+            self.resume.wait(wire.DEADLINE)
+            return Response(200)
+        return self._answer(request)
+
+    async def _answer(self, request: Request) -> Response:
+        await request.body(LARGE)
+        self.read.append((request.path, self._round))
+        return Response(200)
+
+    async def _count(self) -> None:
+        while True:
+            self._round += 1
+            await asyncio.sleep(0)
+
+
+LARGE = LARGE_BODY_BYTES + 1
+
+
+@pytest.fixture
+def reader() -> Reader:
+    return Reader()
+
+
+@pytest.fixture
+def address(reader: Reader) -> Iterator[tuple[str, int]]:
+    """The address of a host with this handler."""
+    sources, limits = [ip_network("127.0.0.0/8")], ConnectionLimits(20)
+    with closing(listen("127.0.0.1", 0)) as listener:
+        host = Host(
+            "x",
+            reader,
+            listener,
+            sources=sources,
+            limits=limits,
+            request_timeout=wire.DEADLINE,
+            stop_timeout=0,
+        )
+        with web.in_a_thread(host):
+            yield listener.getsockname()
+
+
+def sent(address: tuple[str, int], path: str, size: int, source: str | None) -> wire.Connection:
+    """A connection that has sent a request but the last byte of its body."""
+    connection = wire.Connection(address, source=source)
+    connection.send(web.head("POST", path, f"Content-Length: {size}") + b" " * (size - 1))
+    return connection
+
+
+def test_the_loop_does_other_work_between_large_bodies(
+    reader: Reader, address: tuple[str, int]
+) -> None:
+    sources = [None, None, "127.0.0.2", "127.0.0.2", "127.0.0.3", "127.0.0.3"]
+    with ExitStack() as opened:
+        connections = [
+            opened.enter_context(sent(address, f"/{number}", LARGE, source))
+            for number, source in enumerate(sources)
+        ]
+        wire.until(lambda: len(reader.begun) == len(sources), "all are being received")
+        blocking = opened.enter_context(wire.Connection(address))
+        blocking.send(web.head("GET", "/block"))
+        wire.until(lambda: "/block" in reader.begun, "the loop does nothing")
+        for connection in connections:
+            connection.send(b" ")
+            wire.until_taken(connection.socket)
+        reader.resume.set()
+        wire.until(lambda: len(reader.read) == len(sources), "all were read")
+    assert len({turn for _, turn in reader.read}) == len(sources)
+
+
+def test_an_address_has_few_large_bodies_at_a_time(
+    reader: Reader, address: tuple[str, int]
+) -> None:
+    with ExitStack() as opened:
+        held = [
+            opened.enter_context(sent(address, "/held", LARGE, None))
+            for _ in range(LARGE_BODIES_PER_ADDRESS)
+        ]
+        wire.until(lambda: len(reader.begun) == len(held), "all are being received")
+        opened.enter_context(sent(address, "/waits", LARGE, None)).send(b" ")
+        wire.until(lambda: "/waits" in reader.begun, "it has begun")
+        for path, size, source in [("/small", 10, None), ("/other", LARGE, "127.0.0.2")]:
+            opened.enter_context(sent(address, path, size, source)).send(b" ")
+            wire.until(lambda path=path: path in dict(reader.read), "it was read")
+        assert "/waits" not in dict(reader.read)
+        held[0].send(b" ")
+        wire.until(lambda: "/waits" in dict(reader.read), "it was read")
+    assert [path for path, _ in reader.read] == ["/small", "/other", "/held", "/waits"]

@@ -109,6 +109,14 @@ class App(Application):
             raise error
         return json_response(refused.answer(), status=REFUSALS.status(refused.reason))
 
+    def check_writer(self, request: Request) -> None:
+        """Raises `BadRequest` for a client that may not write."""
+        self.grants.check_writer(request.who)
+
+    def check_manager(self, request: Request) -> None:
+        """Raises `BadRequest` for a client that may not manage the appliance."""
+        self.grants.check_manager(request.who)
+
     def ingest(self, request: Request, body: bytes) -> Response | Later:
         """Writes one command or a batch."""
         access, grant = self._memory_access, self.grants.of(request.who)

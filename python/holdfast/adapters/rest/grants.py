@@ -46,6 +46,11 @@ class Grants:
         """What a client is granted."""
         return self._grants[who]
 
+    def check_writer(self, who: str) -> None:
+        """Raises `BadRequest` for a client that may not write."""
+        if not self._grants[who].writes:
+            raise BadRequest("not_granted", f"{who} may not write")
+
     def check_manager(self, who: str) -> None:
         """Raises `BadRequest` for a client that may not manage the appliance."""
         if who not in self._managers:

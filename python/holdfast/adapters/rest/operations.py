@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from holdfast.adapters.rest.app import INGEST, App
 from holdfast.adapters.rest.changes import (
@@ -27,12 +27,8 @@ from holdfast.protocol import ADDRESSES
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from holdfast.net.http.operations import Given, Later
     from holdfast.net.http.refusals import Refusal
-    from holdfast.net.http.requests import Request, Response
     from holdfast.net.http.schemas import Schema
-
-    Handler: TypeAlias = Callable[[App, Request, Given], Response | Later]
 
 _NUMBERS: dict[str, tuple[Callable[[str], float], str, str]] = {
     "integer": (int, "[0-9]{1,10}", "an integer"),
@@ -78,16 +74,6 @@ def _range(most: int = 1) -> tuple[Parameter, ...]:
 
 def _command(area: str, address: int, values: list[int]) -> dict[str, object]:
     return {"memory": "plant_a", "area": area, "address": address, "values": values}
-
-
-def _of_managers(carry_out: Handler) -> Handler:
-    """What carries out an operation, for tokens with `manage: true` only."""
-
-    def checked(app: App, request: Request, given: Given) -> Response | Later:
-        app.grants.check_manager(request.who)
-        return carry_out(app, request, given)
-
-    return checked
 
 
 _MEMORIES = {
@@ -171,6 +157,7 @@ OPERATIONS: tuple[Operation[App], ...] = (
                 ],
             },
         ),
+        check=App.check_writer,
     ),
     Operation(
         "GET",
@@ -252,7 +239,7 @@ OPERATIONS: tuple[Operation[App], ...] = (
         "/api/v1/sessions",
         "sessions",
         "List the open connections of listeners",
-        _of_managers(App.sessions),
+        App.sessions,
         json_answer(
             "The open connections, with the certificate of TLS peers",
             ref("Sessions"),
@@ -260,13 +247,14 @@ OPERATIONS: tuple[Operation[App], ...] = (
         ),
         ("not_granted",),
         "Requires a token with `manage: true`.",
+        check=App.check_manager,
     ),
     Operation(
         "POST",
         "/api/v1/sessions/end",
         "end_session",
         "End an open connection",
-        _of_managers(App.end_session),
+        App.end_session,
         json_answer(
             "The connection was ended",
             ref("EndedSession"),
@@ -276,6 +264,7 @@ OPERATIONS: tuple[Operation[App], ...] = (
         "Requires a token with `manage: true`. The peer can connect again, unless a rule forbids "
         "it.",
         body=Body(ref("EndSession"), {"One session": {"id": "scada/17"}}),
+        check=App.check_manager,
     ),
     *DOCUMENTS,
 )

@@ -137,6 +137,8 @@ class Application:
         if not operation.is_public:
             self.origins.check(request)
             request.who = owner(request, self._tokens) if self._tokens else self._anyone
+        if operation.check is not None:
+            operation.check(self, request)
         parameters: Given = {}
         if operation.body is not None:
             self.check_type(request)

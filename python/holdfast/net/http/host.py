@@ -14,6 +14,7 @@ from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import unquote
+from weakref import WeakValueDictionary
 
 from holdfast._core import HttpServer, ParsedWrites
 from holdfast.events import log_lines
@@ -32,7 +33,7 @@ from holdfast.runtime import tasks
 from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
+    from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator, Mapping
 
     from holdfast._core import HttpExchange, ListeningSocket
     from holdfast.net.addresses import Network
@@ -48,6 +49,13 @@ KEEP_ALIVE_S = 60.0
 
 REQUESTS_PER_BATCH = 16
 """Requests that are answered together. Waking the core for each costs more than the response."""
+
+LARGE_BODY_BYTES = 65_536
+"""Larger bodies take turns: handling one can take a second."""
+
+LARGE_BODIES_PER_ADDRESS = 4
+"""Large bodies of one address that are received or wait for their turn; the next ones wait to be
+received."""
 
 EVICTION_GRACE_S = 1.0
 """Seconds that a peer has to send a request, or to take a response, before it can be evicted."""
@@ -119,6 +127,7 @@ class Host:
         self._open: dict[int, _HostRequest] = {}
         """The requests whose handlers are coroutines, by number."""
         self._tasks: set[asyncio.Task[None]] = set()
+        self._turns = _Turns()
         self._is_flush_due = False
         """Whether responses of coroutines are about to be sent."""
 
@@ -144,6 +153,7 @@ class Host:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._log_loop_error)
         stopped = asyncio.Event()
+        self._turns = _Turns()
         stop.then(partial(tasks.call_soon, loop, stopped.set))
         server = self._server = self._new_server()
         try:
@@ -224,7 +234,7 @@ class Host:
         """Calls the handler. Returns its second step, if it has one."""
         if isinstance(item, ParsedWrites):
             return self._begin_parsed(item)
-        request = _HostRequest(*item)
+        request = _HostRequest(self._turns, *item)
         try:
             outcome = self.handler(request)
         except Exception as error:
@@ -362,13 +372,36 @@ class _WakeSocket(asyncio.BufferedProtocol):
         self._take()
 
 
+class _Turns:
+    """The turns of large bodies, so that they delay other requests by one of them at most, and take
+    limited memory.
+    """
+
+    def __init__(self) -> None:
+        self._handling = asyncio.Lock()
+        self._places: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
+        """Places for bodies, by address; only of those with such a body."""
+
+    @contextlib.asynccontextmanager
+    async def receiving(self, address: str) -> AsyncIterator[None]:
+        """Receives a body in the block. Then the caller has its turn until it waits."""
+        places = self._places.get(address)
+        if places is None:
+            places = self._places[address] = asyncio.Semaphore(LARGE_BODIES_PER_ADDRESS)
+        async with places:
+            yield
+            async with self._handling:
+                await asyncio.sleep(0)  # The event loop does its other work before each turn.
+
+
 class _HostRequest(Request):
     """A request from the core."""
 
-    __slots__ = ("_is_gone", "_waiter", "_when_gone", "exchange", "has_begun")
+    __slots__ = ("_is_gone", "_turns", "_waiter", "_when_gone", "exchange", "has_begun")
 
     def __init__(
         self,
+        turns: _Turns,
         exchange: HttpExchange,
         head: tuple[str, str, bytes, str, Headers, dict[str, Any]],
         peer: str,
@@ -377,6 +410,7 @@ class _HostRequest(Request):
         identity: tuple[str, str, str] | None,
     ) -> None:
         self.exchange = exchange
+        self._turns = turns
         self.has_begun = False
         """Whether a stream has begun."""
         self._is_gone = False
@@ -406,7 +440,13 @@ class _HostRequest(Request):
                 self._when_gone()
 
     async def receive(self, most: int) -> bytes:
-        """Waits for the body."""
+        """Waits for the body, and for the turn of a large one."""
+        if (most if self.length is None else self.length) <= LARGE_BODY_BYTES:
+            return await self._received(most)
+        async with self._turns.receiving(self.peer.rpartition(":")[0]):
+            return await self._received(most)
+
+    async def _received(self, most: int) -> bytes:
         self.exchange.receive(most)
         kind, value = await self._next()
         if kind == "body":

@@ -78,6 +78,9 @@ class Operation(Generic[App]):
     description: str = ""
     parameters: Sequence[Field] = ()
     body: Body | None = None
+    check: Callable[[App, Request], None] | None = None
+    """Raises `BadRequest` for a client without the right to the operation, before its body is
+    received."""
     is_public: bool = False
     """Whether anyone may call it: no token is required, and pages of other sites may link to it."""
     has_head: bool = True
