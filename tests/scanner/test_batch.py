@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import socket
 from itertools import pairwise
@@ -197,6 +198,14 @@ def test_what_the_server_sends_is_taken_apart_wherever_it_is_cut(cuts: list[int]
         b"MSG a b 1",
         b"MSG a 1 x",
         b"HMSG a 1 2",
+        b"MSG a 1 -1",
+        b"MSG a 1 1_0",
+        b"MSG a 1_0 1",
+        b"MSG a 1 %d" % (tolerant_client.MAX_MESSAGE_BYTES + 1),
+        b"HMSG a 1 -1 2",
+        b"HMSG a 1 3 2",
+        b"HMSG a 1 2 %d" % (tolerant_client.MAX_MESSAGE_BYTES + 1),
+        b"INFO " + b"[" * 100_000,
         b"INFO {",
         b"INFO 1",
         b"",
@@ -255,6 +264,25 @@ def test_addresses_of_servers_that_are_none_are_left_out() -> None:
         return await client.transport.readline()
 
     assert asyncio.run(begin()) == b'INFO {"connect_urls": ["10.0.0.9:4222"]}\r\n'
+
+
+def test_the_newest_list_of_a_cluster_counts_up_to_a_limit() -> None:
+    async def servers() -> list[set[str]]:
+        client, found = SafeClient(), []
+        client.transport._io_reader = reader = asyncio.StreamReader()
+        client.options = {"dont_randomize": True}
+        client._setup_server_pool(["nats://configured:1"])
+        client._current_server = client._server_pool[0]
+        for name in ("old", "new"):
+            urls = [f"{name}-{number}:1" for number in range(1000)]
+            reader.feed_data(b"INFO %b\r\n" % json.dumps({"connect_urls": urls}).encode())
+            await client._ps.parse(await client.transport.read(2**20))
+            found.append({server.uri.netloc for server in client._server_pool})
+        return found
+
+    for name, found in zip(("old", "new"), asyncio.run(servers()), strict=True):
+        listed = {f"{name}-{number}:1" for number in range(tolerant_client.MAX_CLUSTER_SERVERS)}
+        assert found == {"configured:1", *listed}
 
 
 def test_a_server_that_takes_no_more_bytes_does_not_hold_up_the_end_of_a_connection() -> None:

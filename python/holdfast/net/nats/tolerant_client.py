@@ -46,6 +46,14 @@ CLOSE_TIMEOUT_S = 1.0
 MAX_LINE_BYTES = 1024 * 1024
 """The longest line of the protocol in bytes. INFO lines are the longest."""
 
+MAX_MESSAGE_BYTES = 64 * 1024 * 1024 + 65_536
+"""The largest message in bytes: the most that `max_payload` of a server may be, and headers that
+JetStream adds. The `max_payload` of one server says nothing about the messages of others, or of
+those that are stored already."""
+
+MAX_CLUSTER_SERVERS = 64
+"""The most servers that are taken from the list of a cluster. Clusters have at most a dozen."""
+
 
 class ServerError(Error):
     """An error that the server reports and after which the connection goes on.
@@ -298,21 +306,31 @@ def _head(rest: bytes, *, with_header: bool) -> _Head:
     names = len(parts) - 1 - with_header
     try:
         subject, sid, *reply = parts[:names]
-        header, size = map(int, [b"0"] * (not with_header) + parts[names:])
-        return _Head(subject, int(sid), b"".join(reply), header, size)
+        header, size = map(_number, [b"0"] * (not with_header) + parts[names:])
+        head = _Head(subject, _number(sid), b"".join(reply), header, size)
     except ValueError:
         raise ProtocolError("nats: malformed MSG") from None
+    if not header <= size <= MAX_MESSAGE_BYTES:
+        raise ProtocolError(f"nats: found a message of {size} bytes, {header} of them its headers")
+    return head
+
+
+def _number(digits: bytes) -> int:
+    """Raises `ValueError` for anything but digits."""
+    if not digits.isdigit():
+        raise ValueError("not a number")
+    return int(digits)
 
 
 def _decoded(info: bytes) -> dict[str, Any]:
     try:
         found = json.loads(info)
-    except ValueError:
+    except (ValueError, RecursionError):
         found = None
     if not isinstance(found, dict):
         raise ProtocolError("nats: malformed INFO")
     if (urls := found.pop("connect_urls", None)) and isinstance(urls, list):
-        found["connect_urls"] = [url for url in urls if _is_url(url)]
+        found["connect_urls"] = [url for url in urls[:MAX_CLUSTER_SERVERS] if _is_url(url)]
     return found
 
 
@@ -391,6 +409,16 @@ class SafeClient(Client):
             return
         self._err = ServerError(f"nats: {text}")
         await self._error_cb(self._err)
+
+    async def _process_info(self, info: dict[str, Any], initial_connection: bool = False) -> None:
+        """Takes the servers of the cluster in place of those listed before, which nats-py keeps."""
+        if listed := info.get("connect_urls"):
+            self._server_pool[:] = [
+                each
+                for each in self._server_pool
+                if not each.discovered or each is self._current_server or each.uri.netloc in listed
+            ]
+        await super()._process_info(info, initial_connection)
 
     def _heard(self) -> None:
         """Resets nats-py's count of unanswered pings.
