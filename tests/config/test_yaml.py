@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+import sys
+from collections import deque
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given
@@ -12,9 +15,12 @@ from hypothesis import strategies as st
 from holdfast._core import yaml_events
 from holdfast.config import ConfigError
 from holdfast.config.dump import to_yaml
-from holdfast.config.text import yaml_document
+from holdfast.config.text import slow_yaml, yaml_document
 from holdfast.config.text.yaml_document import parse
 from support.paths import DOCS, EXAMPLES
+
+if TYPE_CHECKING:
+    from types import FrameType
 
 FILES = sorted(EXAMPLES.rglob("*.yaml"))
 BLOCKS = [
@@ -63,6 +69,30 @@ def test_a_brace_may_be_left_of_its_key() -> None:
     text = "memories:\n  plant: {coils: 8,\n}\n"
     assert yaml_events(text, yaml_document.MAX_WRITTEN) is None
     assert parse(text, "file")[0].data == {"memories": {"plant": {"coils": 8}}}
+
+
+def steps(text: str) -> int:
+    """The lines that run to read text with the slow parser."""
+    count = 0
+
+    def trace(_: FrameType, event: str, __: object) -> Any:
+        nonlocal count
+        count += event == "line"
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        with suppress(ConfigError):
+            deque(slow_yaml.events(text, "f"), 0)
+    finally:
+        sys.settrace(before)
+    return count
+
+
+def test_the_work_for_brackets_grows_as_their_number() -> None:
+    steps("[" * 10)
+    assert steps("[" * 800) < 3 * steps("[" * 400)
 
 
 @pytest.mark.parametrize("character", ["\x07", "\x7f", "\x9f", "\ufffe"])

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import threading
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 import holdfast
+from holdfast.gateway.app import SHORT_BYTES
+from holdfast.gateway.endpoints import request_tags
 from holdfast.tags import Tag, TagList
-from support import gateways
+from support import gateways, web, wire
 from support.fake_device import FakeDevice, exception, registers
 
 if TYPE_CHECKING:
@@ -300,6 +304,90 @@ def test_hostile_lists_are_refused(gateway: Running, text: str, says: str | None
     answer = local(gateway, "/tags", {"tags": text})
     assert answer.status == (200 if says is None else 400)
     assert says is None or says in answer.json["error"]
+
+
+class Parser:
+    """Parses tag lists in place of the gateway, once a test lets it."""
+
+    def __init__(self) -> None:
+        self.begun: list[str] = []
+        self.resume = threading.Event()
+
+    def __call__(self, text: str, is_csv: bool) -> TagList:  # noqa: ARG002
+        self.begun.append(text)
+        assert self.resume.wait(wire.DEADLINE)
+        return PROFILE
+
+
+@pytest.fixture
+def parser(monkeypatch: pytest.MonkeyPatch) -> Iterator[Parser]:
+    parser = Parser()
+    monkeypatch.setattr(request_tags, "_parsed", parser)
+    yield parser
+    parser.resume.set()
+
+
+@pytest.fixture
+def post(gateway: Running) -> Iterator[Callable[..., wire.Connection]]:
+    """Sends a tag list from an address, which is then one of so many requests."""
+    with ExitStack() as opened:
+
+        def posted(text: str, source: str | None = None, *, pending: int) -> wire.Connection:
+            body = json.dumps({"tags": text}).encode()
+            more = "Content-Type: application/json", f"Content-Length: {len(body)}"
+            connection = opened.enter_context(wire.Connection(gateway.address, source=source))
+            connection.send(web.head("POST", "/api/gateway/tags", *more, "Connection: close"))
+            connection.send(body)
+            until_pending(gateway, pending)
+            return connection
+
+        yield posted
+
+
+def until_pending(gateway: Running, count: int) -> None:
+    active = gateway.gateway._app._active
+    wire.until(lambda: active["requests"] == count, f"{count} requests")
+
+
+def test_addresses_take_turns_with_their_lists(
+    parser: Parser, post: Callable[..., wire.Connection]
+) -> None:
+    texts = [f"{name:<{SHORT_BYTES}}" for name in ("a1", "a2", "a3")]
+    waiting = [post(text, pending=at) for at, text in enumerate(texts, 1)]
+    waiting.append(post("b1", "127.0.0.2", pending=4))
+    waiting.append(post("short", pending=5))
+    parser.resume.set()
+    for connection in waiting:
+        [answer] = web.answers(connection.rest())
+        assert answer.status == 200
+    assert [text.strip() for text in parser.begun] == ["a1", "b1", "short", "a2", "a3"]
+
+
+def test_the_list_of_a_client_that_has_gone_is_not_parsed(
+    gateway: Running, parser: Parser, post: Callable[..., wire.Connection]
+) -> None:
+    first = post("a", pending=1)
+    post("b", "127.0.0.2", pending=2).close()
+    until_pending(gateway, 1)
+    last = post("c", "127.0.0.3", pending=2)
+    parser.resume.set()
+    for connection in (first, last):
+        assert web.answers(connection.rest())[0].status == 200
+    assert parser.begun == ["a", "c"]
+
+
+def test_a_stop_does_not_wait_for_lists(parser: Parser) -> None:
+    with gateways.running(limits={"ending": SOON}) as stopping:
+        client = wire.Connection(stopping.address)
+        body = b'{"tags": "a"}'
+        more = "Content-Type: application/json", f"Content-Length: {len(body)}"
+        client.send(web.head("POST", "/api/gateway/tags", *more) + body)
+        wire.until(lambda: parser.begun, "it is being parsed")
+        stopping.stop.set()
+        with client:
+            [answer] = web.answers(client.rest())
+    assert answer.status == 503
+    assert not parser.resume.is_set()
 
 
 def test_lists_are_bounded(gateway: Running) -> None:

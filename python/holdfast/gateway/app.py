@@ -40,6 +40,7 @@ from holdfast.net.http.requests import (
     response,
 )
 from holdfast.net.resolver import Resolver
+from holdfast.runtime import tasks
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Coroutine, Iterable, Iterator, Mapping
@@ -55,14 +56,18 @@ if TYPE_CHECKING:
     from holdfast.net.resolver import Resolve
     from holdfast.tags import TagList
 
-    Check: TypeAlias = Callable[[Given, Mapping[str, TagList]], Awaitable[Answer]]
-
 Result = TypeVar("Result")
+
+Parse: TypeAlias = "Callable[[Given, Mapping[str, TagList]], Awaitable[Result]]"
+"""Parses what a request has, with the tag lists of the profiles."""
 
 REASON = b"holdfast-reason"
 EXCEPTION = b"holdfast-exception"
 FORM = b"application/x-www-form-urlencoded"
 """The default Content-Type of `curl -d`. The gateway treats it as JSON."""
+
+SHORT_BYTES = 8192
+"""Requests up to this size don't wait until the longer ones of their address are parsed."""
 
 STOPPING = "the gateway is stopping"
 HOSTS = "--host, or hosts in the configuration"
@@ -108,6 +113,8 @@ class App(Application):
         self._active: Counter[object] = Counter()
         """The number of pending `requests` and `streams`, of requests by host and port of the
         device, and of streams by address of the client."""
+        self._parsing = tasks.Places(1)
+        """Whose requests are parsed, by address of the client and whether they are long."""
         self._requests = self._failed = self._writes = 0
         self._refused: dict[str, int] = {}
         self._ending = asyncio.Event()
@@ -346,8 +353,7 @@ class App(Application):
 
     async def view(self, request: Request, given: Given) -> None:
         """Follows several ranges and tag lists of a device."""
-        with self._request():
-            parts = await views.parts_of(given, self._settings.profiles)
+        parts = await self._parsed(request, views.parts_of, given)
         device = RequestedDevice(self._egress, self._pool, given)
         streaming = not given["once"] and self._has_stream(request, given["maxStreams"])
         with contextlib.ExitStack() as places:
@@ -395,10 +401,25 @@ class App(Application):
 
     # Answers without a device.
 
-    async def check(self, check: Check, given: Given) -> Response:
+    async def check(self, request: Request, check: Parse[Answer], given: Given) -> Response:
         """Checks tags or values."""
+        return json_response(await self._parsed(request, check, given))
+
+    async def _parsed(self, request: Request, parse: Parse[Result], given: Given) -> Result:
+        """Parses what a request has; of each address, one long and one short at a time."""
+        is_long = len(request.whole or b"") > SHORT_BYTES
+
+        async def in_turn() -> Result:
+            async with self._parsing.of((host_of(request.peer), is_long)):
+                return await parse(given, self._settings.profiles)
+
         with self._request():
-            return json_response(await check(given, self._settings.profiles))
+            try:
+                return await self._until_disconnect(request, in_turn(), grace=self._limits.ending)
+            except ClientDisconnected:
+                if not self._ending.is_set():
+                    raise
+                raise BadRequest("stopping", STOPPING) from None
 
     def profiles(self) -> Response:
         """Returns the names of the profiles, and how many tags they have."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 from typing import TYPE_CHECKING, Any, TypeVar
+from weakref import WeakValueDictionary
 
 from holdfast.runtime.heartbeat import PERIOD_S
 
@@ -66,6 +67,21 @@ async def within(seconds: float | None, step: Awaitable[object]) -> None:
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await step
+
+
+class Places:
+    """Places by key: up to `most` tasks have one of the same key at a time, the others wait."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._used: WeakValueDictionary[object, asyncio.Semaphore] = WeakValueDictionary()
+
+    def of(self, key: object) -> asyncio.Semaphore:
+        """Returns the places of a key."""
+        places = self._used.get(key)
+        if places is None:
+            places = self._used[key] = asyncio.Semaphore(self._most)
+        return places
 
 
 @contextlib.asynccontextmanager

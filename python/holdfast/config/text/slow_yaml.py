@@ -5,7 +5,7 @@ It also accepts a `}` left of the key that it belongs to, which many write, and 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
@@ -18,6 +18,7 @@ from ruamel.yaml.events import (
     SequenceEndEvent,
     SequenceStartEvent,
 )
+from ruamel.yaml.scanner import Scanner
 
 from holdfast.config.text.messages import PATH_QUOTES
 from holdfast.config.text.problems import ConfigError, Problem
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from holdfast.types import YamlEvent
+
+MAX_KEY_LENGTH = 1024
+"""Characters of a key without `?`, by YAML."""
 
 _QUOTES = "text that begins with [, { or a quote needs quotes around the whole, as in '[::1]:502'"
 
@@ -85,10 +89,32 @@ def events(text: str, file: str) -> Iterator[YamlEvent]:
         raise ConfigError(file, [Problem(file, None, None, "", f"not YAML: {error}")]) from None
 
 
+class _Scanner(Scanner):
+    """Looks at the first place where a key may begin, not at all of them: they are in order.
+
+    Otherwise, reading nested brackets takes time by the square of their depth.
+    """
+
+    def next_possible_simple_key(self) -> Any:
+        return next((key.token_number for key in self.possible_simple_keys.values()), None)
+
+    def stale_possible_simple_keys(self) -> None:
+        keys = self.possible_simple_keys
+        while keys:
+            level, key = next(iter(keys.items()))
+            if key.line == self.reader.line and self.reader.index - key.index <= MAX_KEY_LENGTH:
+                return
+            if key.required:
+                super().stale_possible_simple_keys()  # Raises.
+            del keys[level]
+
+
 def _events(text: str) -> Iterator[YamlEvent]:
     documents = 0
     anchors: set[str | None] = {None}
-    for event in YAML(typ="safe", pure=True).parse(text):
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Scanner = _Scanner
+    for event in yaml.parse(text):
         mark = event.start_mark
         at = mark.line + 1, mark.column + 1
         anchor = getattr(event, "anchor", None)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 from holdfast import values
@@ -12,6 +11,7 @@ from holdfast.config.tag_files.read import parse_tags
 from holdfast.config.tag_files.write import scale_as_data
 from holdfast.net.http.fields import Field, malformed
 from holdfast.net.http.requests import shown
+from holdfast.runtime.own_thread import OwnThread
 from holdfast.runtime.text import listing, suggestion
 from holdfast.tags.scale import RegisterScale
 from holdfast.tags.text import plain, text_of, value_from
@@ -62,6 +62,8 @@ VALUE = Field(
 )
 LIST = (TEXT, FORMAT, PROFILE)
 
+_PARSER = OwnThread("holdfast-tag-lists")
+
 
 async def tags_of(given: Given, profiles: Mapping[str, TagList]) -> TagList:
     """Returns the tag list of a request. Raises `BadRequest`."""
@@ -70,7 +72,7 @@ async def tags_of(given: Given, profiles: Mapping[str, TagList]) -> TagList:
         raise malformed("one of tags and profile is required")
     if profile is None:
         # Parsing a long list takes a second, in which other requests are answered.
-        return await asyncio.to_thread(_parsed, text, given["format"] == "csv")
+        return await _PARSER.call(partial(_parsed, text, given["format"] == "csv"))
     if profile not in profiles:
         known = listing(profiles) or "none, the configuration has no profiles"
         hint = suggestion(profile, profiles)

@@ -81,7 +81,7 @@ OPERATIONS: tuple[Operation[Any], ...] = (
         "/api/gateway/tags",
         "tags",
         "Check a tag list",
-        lambda app, _, given: app.check(request_tags.parse, given),
+        lambda app, request, given: app.check(request, request_tags.parse, given),
         _valid({"tags": array_of(TAG)}, {"tags": [_SETPOINT]}),
         ("busy",),
         "Parses a tag list as the command line does, and returns its tags. An error names the "
@@ -93,7 +93,7 @@ OPERATIONS: tuple[Operation[Any], ...] = (
         "/api/gateway/tags/value",
         "tagValue",
         "Check a value of a tag before it is written",
-        lambda app, _, given: app.check(request_tags.encode, given),
+        lambda app, request, given: app.check(request, request_tags.encode, given),
         _valid(
             {
                 "tag": TAG,
@@ -134,7 +134,7 @@ OPERATIONS: tuple[Operation[Any], ...] = (
         "/api/gateway/values",
         "values",
         "Check typed values before they are written",
-        lambda app, _, given: app.check(typed.encode, given),
+        lambda app, request, given: app.check(request, typed.encode, given),
         _valid(
             {"values": REGISTERS, **TYPED},
             {"values": [0, 0x41AC], "typed": [21.5], "typedText": ["21.5"]},
@@ -167,7 +167,7 @@ OPERATIONS: tuple[Operation[Any], ...] = (
         "/api/gateway/types",
         "types",
         "Show registers in every type and byte order",
-        lambda app, _, given: app.check(typed.every, given),
+        lambda app, request, given: app.check(request, typed.every, given),
         _valid({"tables": array_of(_TABLE)}, {"tables": typed.tables([0x41AC])}),
         ("busy",),
         "Returns tables of texts: a row for each type that the registers hold, a column for each "

@@ -14,7 +14,6 @@ from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 from urllib.parse import unquote
-from weakref import WeakValueDictionary
 
 from holdfast._core import HttpServer, ParsedWrites
 from holdfast.events import log_lines
@@ -379,16 +378,12 @@ class _Turns:
 
     def __init__(self) -> None:
         self._handling = asyncio.Lock()
-        self._places: WeakValueDictionary[str, asyncio.Semaphore] = WeakValueDictionary()
-        """Places for bodies, by address; only of those with such a body."""
+        self._places = tasks.Places(LARGE_BODIES_PER_ADDRESS)
 
     @contextlib.asynccontextmanager
     async def receiving(self, address: str) -> AsyncIterator[None]:
         """Receives a body in the block. Then the caller has its turn until it waits."""
-        places = self._places.get(address)
-        if places is None:
-            places = self._places[address] = asyncio.Semaphore(LARGE_BODIES_PER_ADDRESS)
-        async with places:
+        async with self._places.of(address):
             yield
             async with self._handling:
                 await asyncio.sleep(0)  # The event loop does its other work before each turn.
