@@ -49,6 +49,13 @@ DEVICE = "devices: {a: {url: tcp://a, tags: {x: {area: coils, address: 1}}, inte
         ("{type: influx, url: 'ftp://h', bucket: b}", "o.url: found neither http:// nor https://"),
         ("{type: influx, url: 'http://h/a b'}", "o.url: found a path with blanks"),
         ("{type: influx, url: 'http://u:p@h/w'}", "o.url: found a user in the URL"),
+        *(
+            (
+                f"{{type: influx, url: 'http://h/w?db=a{more}'}}",
+                "o.url: found credentials in the query of the URL, allowed: none; set username",
+            )
+            for more in ("&u=x&p=y", "&P=y", "&token=y", "&Token=y", "&%70=y", ";p=y", "&p")
+        ),
         (
             "{type: influx, url: 'http://h/w', measurement: '#1 pump'}",
             "o.measurement: found '#1 pump', allowed: text that neither begins with # nor ends in",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from typing import TYPE_CHECKING, Literal, NamedTuple
+from urllib.parse import unquote
 
 from holdfast.config.text.messages import shape, show
 from holdfast.net.addresses import LAST_PORT, joined
@@ -56,6 +57,8 @@ def parse_remote(
 
 HTTP_FORM = "http://host:port/path or https://host:port/path"
 _HTTP_PORTS = {"http": 80, "https": 443}
+_CREDENTIALS = {"u", "p", "token"}
+"""The query parameters for a user, a password and a token: those of InfluxDB 1."""
 _PATH = re.compile(r"[/?][!-~]*")
 
 
@@ -78,6 +81,11 @@ def parse_http(text: object) -> HttpTarget:
     remote = parse_remote(scheme + mark + host if whole else text, _HTTP_PORTS, HTTP_FORM)
     if path and _PATH.fullmatch(path) is None:
         raise ValueError(f"found a path with blanks or other characters, allowed: {HTTP_FORM}")
+    parameters = re.split("[&;]", path.partition("?")[2])
+    names = {unquote(each.partition("=")[0]).lower() for each in parameters}
+    if not names.isdisjoint(_CREDENTIALS):
+        where = "set username and password_file, or token_file, instead"
+        raise ValueError(f"found credentials in the query of the URL, allowed: none; {where}")
     return HttpTarget(remote.host, remote.port, remote.scheme == "https", path)
 
 
