@@ -88,6 +88,8 @@ def test_a_command_that_is_delivered_again_is_not_carried_out_again(
     plant.run(**output, writes=True, url=fake.url, version=fake.version)
     with fake.accept() as peer:
         until(peer, mqtt.SUBSCRIBE, topic.encode())
+        if output:
+            until(peer, mqtt.PUBLISH, b"DBIRTH")  # Before it, the device is not known.
         peer.send(mqtt.publish(topic, payload, 1, 7, version=fake.version))
         until(peer, mqtt.PUBACK, b"\0\x07")
         wire.until(lambda: valve.read("coils", 0, 1) == [1], "it is carried out")
@@ -144,6 +146,8 @@ def test_a_command_that_is_too_large_is_acknowledged_and_refused(
     plant.run(**output, writes=True, url=fake.url, version=fake.version)
     with fake.accept() as peer:
         until(peer, mqtt.SUBSCRIBE, topic.encode())
+        if output:
+            until(peer, mqtt.PUBLISH, b"DBIRTH")
         peer.send(mqtt.publish(topic, bytes(size), 1, 7, version=fake.version))
         until(peer, mqtt.PUBACK, b"\0\x07")
         if not output:
