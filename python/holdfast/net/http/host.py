@@ -32,7 +32,7 @@ from holdfast.runtime import tasks
 from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterator, Mapping
+    from collections.abc import Awaitable, Callable, Collection, Iterator, Mapping
 
     from holdfast._core import HttpExchange, ListeningSocket
     from holdfast.net.addresses import Network
@@ -51,10 +51,6 @@ REQUESTS_PER_BATCH = 16
 
 LARGE_BODY_BYTES = 65_536
 """Larger bodies take turns: handling one can take a second."""
-
-LARGE_BODIES_PER_ADDRESS = 4
-"""Large bodies of one address that are received or wait for their turn; the next ones wait to be
-received."""
 
 EVICTION_GRACE_S = 1.0
 """Seconds that a peer has to send a request, or to take a response, before it can be evicted."""
@@ -126,7 +122,8 @@ class Host:
         self._open: dict[int, _HostRequest] = {}
         """The requests whose handlers are coroutines, by number."""
         self._tasks: set[asyncio.Task[None]] = set()
-        self._turns = _Turns()
+        self._turns = asyncio.Lock()
+        """Of large bodies."""
         self._is_flush_due = False
         """Whether responses of coroutines are about to be sent."""
 
@@ -152,7 +149,7 @@ class Host:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._log_loop_error)
         stopped = asyncio.Event()
-        self._turns = _Turns()
+        self._turns = asyncio.Lock()
         stop.then(partial(tasks.call_soon, loop, stopped.set))
         server = self._server = self._new_server()
         try:
@@ -371,24 +368,6 @@ class _WakeSocket(asyncio.BufferedProtocol):
         self._take()
 
 
-class _Turns:
-    """The turns of large bodies, so that they delay other requests by one of them at most, and take
-    limited memory.
-    """
-
-    def __init__(self) -> None:
-        self._handling = asyncio.Lock()
-        self._places = tasks.Places(LARGE_BODIES_PER_ADDRESS)
-
-    @contextlib.asynccontextmanager
-    async def receiving(self, address: str) -> AsyncIterator[None]:
-        """Receives a body in the block. Then the caller has its turn until it waits."""
-        async with self._places.of(address):
-            yield
-            async with self._handling:
-                await asyncio.sleep(0)  # The event loop does its other work before each turn.
-
-
 class _HostRequest(Request):
     """A request from the core."""
 
@@ -396,7 +375,7 @@ class _HostRequest(Request):
 
     def __init__(
         self,
-        turns: _Turns,
+        turns: asyncio.Lock,
         exchange: HttpExchange,
         head: tuple[str, str, bytes, str, Headers, dict[str, Any]],
         peer: str,
@@ -436,10 +415,11 @@ class _HostRequest(Request):
 
     async def receive(self, most: int) -> bytes:
         """Waits for the body, and for the turn of a large one."""
-        if (most if self.length is None else self.length) <= LARGE_BODY_BYTES:
-            return await self._received(most)
-        async with self._turns.receiving(self.peer.rpartition(":")[0]):
-            return await self._received(most)
+        body = await self._received(most)
+        if len(body) > LARGE_BODY_BYTES:
+            async with self._turns:
+                await asyncio.sleep(0)  # The event loop does its other work before each of them.
+        return body
 
     async def _received(self, most: int) -> bytes:
         self.exchange.receive(most)
