@@ -346,6 +346,24 @@ def test_a_poll_of_a_device_that_was_replaced_is_not_of_the_new_one(tmp_path: Pa
         found.join(wire.DEADLINE)
 
 
+def test_a_device_has_its_tags_since_the_reload_that_changed_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = settings(502)
+    made["devices"]["other"] = dict(made["devices"]["m"])
+    polls: Any = Polls()
+    found = TagValues(polls, time.monotonic())
+    monkeypatch.setattr(time, "time", lambda: 100.0)
+    found.adopt(load(saved(tmp_path, made)))
+    made["devices"]["m"]["tags"] = {"new": {"area": "coils", "address": 1}}
+    monkeypatch.setattr(time, "time", lambda: 200.0)
+    found.adopt(load(saved(tmp_path, made)))
+    assert found.tagged_since == {"m": 200.0, "other": 100.0}
+    del made["devices"]["m"]
+    found.adopt(load(saved(tmp_path, made)))
+    assert found.tagged_since == {"other": 100.0}
+
+
 def test_a_device_that_another_node_polls_has_no_values(tmp_path: Path) -> None:
     made = settings(502)
     made["outputs"]["out"]["publish"] = "change"

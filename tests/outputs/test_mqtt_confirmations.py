@@ -92,6 +92,9 @@ class Site:
     def tags(self) -> dict[str, Any]:
         return {}
 
+    def tagged_since(self) -> dict[str, float]:
+        return {}
+
     def devices(self) -> dict[str, Any]:
         return {}
 

@@ -52,6 +52,9 @@ class Site(Protocol):
     def tags(self) -> Mapping[str, Sequence[Tag]]:
         """The tags of each device."""
 
+    def tagged_since(self) -> Mapping[str, float]:
+        """Since when each device has had its tags: older readings are of an earlier start."""
+
     def devices(self) -> Mapping[str, DeviceInfo]:
         """What is known of each device."""
 

@@ -126,6 +126,8 @@ class TagValues:
         """Changes with the tags of any device, and with `devices`."""
         self.devices: dict[str, DeviceInfo] = {}
         """What is known of each device with tags. Replaced as a whole."""
+        self.tagged_since: dict[str, float] = {}
+        """Since when each device has had its tags. Replaced as a whole."""
         self.retained: dict[tuple[str, str], str] = {}
         """Of each broker and topic that it retains, the output that published it: see `Site`."""
         self.answers = 0
@@ -169,6 +171,8 @@ class TagValues:
             devices = {name: _info(config.devices[name]) for name in readers}
             self.revision += bool(changed) or devices != self.devices
             self.devices = devices
+            began = {name: at for name, at in self.tagged_since.items() if name not in changed}
+            self.tagged_since = dict.fromkeys(readers, time.time()) | began
             self._answering = {
                 name: answers for name, answers in self._answering.items() if name in readers
             }

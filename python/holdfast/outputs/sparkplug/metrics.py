@@ -37,8 +37,12 @@ class Entry(NamedTuple):
 class DeviceMetrics:
     """The metrics of one device, and what a host knows of them. For one thread."""
 
-    def __init__(self, device: str, tags: Sequence[Tag], *, always_typed: bool) -> None:
+    def __init__(
+        self, device: str, tags: Sequence[Tag], since: float, *, always_typed: bool
+    ) -> None:
+        """`since` is when the device got these tags."""
         self.device = device
+        self._since = since
         self._always_typed = always_typed
         self._tags = {tag.name: tag for tag in tags}
         self._entries: dict[str, list[Entry]] = {}
@@ -46,7 +50,8 @@ class DeviceMetrics:
         """The metrics by name. This and `by_alias` are for all threads."""
         self.by_alias: dict[int, Entry] = {}
         self._births: dict[str, float] = {}
-        """When the tags had their values of the last birth."""
+        """When the tags had their values of the last birth. Without a value: when the device got
+        its tags, because a poll that was answered before a birth may come after it."""
         self._bad: set[str] = set()
 
     def birth(self, payload: Any, latest: Mapping[str, Reading], aliases: Iterator[int]) -> None:
@@ -61,7 +66,8 @@ class DeviceMetrics:
             reading = latest.get(name)
             if reading is not None and not self._is_of_same_meaning(reading):
                 reading = None
-            at = self._births[name] = time.time() if reading is None else reading.time
+            at = time.time() if reading is None else reading.time
+            self._births[name] = self._since if reading is None else at
             for entry in entries:
                 metric = payload.metrics.add(
                     name=entry.name,
