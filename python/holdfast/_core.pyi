@@ -92,6 +92,7 @@ __all__ = [
     "Stale",
     "TlsChannel",
     "UnusableMemoryFile",
+    "Withdrawal",
     "WriteQueue",
     "__version__",
     "encode_raw_ingest",
@@ -1416,7 +1417,14 @@ class Link:
         clients of its routes wait. `None`: it has no routes.
         """
 
-    def route(self, name: str, *, timeout: float, unit: int | None = None) -> Route:
+    def route(
+        self,
+        name: str,
+        *,
+        timeout: float,
+        unit: int | None = None,
+        withdrawal: Withdrawal | None = None,
+    ) -> Route:
         """A target for the units of a `Rule`: their requests go to `unit` of this link.
 
         Without `unit`, they keep their unit id. `timeout` is in seconds, from the moment when a
@@ -1490,6 +1498,14 @@ class Passage:
 @final
 class Route:
     """Where a listener passes on the requests to a unit."""
+
+@final
+class Withdrawal:
+    """Withdraws the requests of routes."""
+
+    def __new__(cls) -> Self: ...
+    def withdraw(self) -> None:
+        """What still waits for its turn is not sent any more: clients get exception 0A."""
 
 @final
 class Results:

@@ -174,6 +174,54 @@ def test_a_reload_names_a_link_after_the_device_that_is_behind_it_then(
         }
 
 
+def test_a_reload_withdraws_what_waits_for_a_device_that_it_changes_and_nothing_else(
+    device: Stream, run: Run, tmp_path: Path
+) -> None:
+    units = {"moved": 1, "kept": 2, "unrouted": 3, "removed": 4}
+    devices: dict[str, Any] = {
+        name: {"url": device.url, "unit": 1, "timeout": wire.DEADLINE} for name in units
+    }
+    writes = {name: bytes((6, 0, unit, 0, 7)) for name, unit in units.items()}
+    held = Held()
+    device.script = [held]
+
+    def reload(*routes: str) -> None:
+        file = tmp_path / "changed.yaml"
+        behind: dict[int | str, Any] = {units[name]: {"route": name} for name in routes}
+        file.write_text(configuration("tcp://127.0.0.1:1", units=behind, devices=devices))
+        appliance.reload(load(file))
+
+    def waits(number: int) -> None:
+        await_count(appliance, "waiting", number, "moved")
+
+    behind: dict[int | str, Any] = {unit: {"route": name} for name, unit in units.items()}
+    appliance = run(configuration("tcp://127.0.0.1:1", units=behind, devices=devices))
+    with contextlib.ExitStack() as stack, Stream("tcp") as other:
+        clients = {
+            name: stack.enter_context(wire.Connection(endpoint(appliance, "scada")))
+            for name in ("under way", *units)
+        }
+        clients["under way"].send(wire.frame(READ))
+        device.await_requests(1)
+        for number, (name, unit) in enumerate(units.items(), 2):
+            clients[name].send(wire.frame(writes[name], unit))
+            waits(number)
+        # A route with another timeout is still the same one.
+        devices["moved"]["timeout"] = wire.DEADLINE + 1
+        reload("moved", "kept", "removed")
+        devices["moved"]["url"] = other.url
+        del devices["removed"]
+        reload("moved", "kept")
+        held.release()
+        replies = {name: client.receive().pdu for name, client in clients.items()}
+        refused = dict.fromkeys(("moved", "removed"), exception(b"\6", 0x0A))
+        assert replies == {"under way": FIVE, **writes, **refused}
+        sent = [asked.pdu for asked in device.requests]
+        assert sent == [READ, writes["kept"], writes["unrouted"]]
+        assert ask(appliance, writes["moved"]) == writes["moved"]
+        assert [asked.pdu for asked in other.requests] == [writes["moved"]]
+
+
 def test_the_log_has_that_a_device_does_not_answer(run: Run, records: web.Records) -> None:
     with Stream("tcp", then=silent) as device:
         appliance = run(configuration(device.url, link={"timeout": 0.1}))

@@ -63,7 +63,7 @@ mod _core {
     #[pymodule_export]
     use super::lease_fence::Fence;
     #[pymodule_export]
-    use super::link::{Caller, Link, Passage, Route};
+    use super::link::{Caller, Link, Passage, Route, Withdrawal};
     #[pymodule_export]
     use super::listener::{Listener, RawRule, Rule};
     #[pymodule_export]

@@ -1,4 +1,4 @@
-//! `Link`, `Route`, `Passage` and `Caller`: devices that listeners and event loops ask.
+//! `Link`, `Route`, `Withdrawal`, `Passage` and `Caller`: devices that listeners and event loops ask.
 
 use std::net::IpAddr;
 use std::sync::{Arc, Mutex};
@@ -7,6 +7,7 @@ use holdfast_engine::Wakes;
 use holdfast_engine::client::StrayCounters;
 use holdfast_engine::link::{
     Caller as CoreCaller, InFlight, LinkSettings, Route as CoreRoute, SharedLink,
+    Withdrawal as CoreWithdrawal,
 };
 use holdfast_engine::poller::{Passage as CorePassage, PassedRange};
 use holdfast_memory::Area;
@@ -77,13 +78,20 @@ impl Link {
         Arc::as_ptr(&self.core).addr()
     }
 
-    #[pyo3(signature = (name, *, timeout, unit=None))]
-    fn route(&self, name: &str, timeout: f64, unit: Option<i128>) -> PyResult<Route> {
+    #[pyo3(signature = (name, *, timeout, unit=None, withdrawal=None))]
+    fn route(
+        &self,
+        name: &str,
+        timeout: f64,
+        unit: Option<i128>,
+        withdrawal: Option<PyRef<'_, Withdrawal>>,
+    ) -> PyResult<Route> {
         let core = CoreRoute {
             name: name.into(),
             link: Arc::clone(&self.core),
             unit_id: unit.map(|unit| byte("unit", unit)).transpose()?,
             timeout: seconds("timeout", timeout)?,
+            withdrawal: withdrawal.map(|own| Arc::clone(&own.core)).unwrap_or_default(),
         };
         Ok(Route { core })
     }
@@ -264,4 +272,21 @@ pub(crate) fn passed(ranges: Vec<Passed>) -> PyResult<Vec<PassedRange>> {
 #[pyclass(frozen, module = "holdfast")]
 pub struct Route {
     pub(crate) core: CoreRoute,
+}
+
+#[pyclass(frozen, module = "holdfast")]
+pub struct Withdrawal {
+    core: Arc<CoreWithdrawal>,
+}
+
+#[pymethods]
+impl Withdrawal {
+    #[new]
+    fn new() -> Withdrawal {
+        Withdrawal { core: Arc::default() }
+    }
+
+    fn withdraw(&self) {
+        self.core.withdraw();
+    }
 }

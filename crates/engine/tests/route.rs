@@ -11,7 +11,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use holdfast_engine::client::Place;
-use holdfast_engine::link::{InFlight, LinkSettings, Route, SharedLink};
+use holdfast_engine::link::{InFlight, LinkSettings, Route, SharedLink, Withdrawal};
 use holdfast_engine::poller::Poller;
 use holdfast_engine::server::reports::event::Verbosity;
 use holdfast_engine::server::requests::unit_server::UnitSettings;
@@ -122,6 +122,7 @@ struct Setup {
     engine: Engine,
     poller: Poller,
     link: Arc<SharedLink>,
+    withdrawal: Arc<Withdrawal>,
 }
 
 impl Setup {
@@ -142,8 +143,14 @@ impl Setup {
             preferred: Vec::new(),
         };
         let link = poller.link(link).unwrap();
-        let (name, timeout) = ("device".into(), TIMEOUT);
-        let route = Route { name, link: Arc::clone(&link), unit_id: None, timeout };
+        let withdrawal = Arc::<Withdrawal>::default();
+        let route = Route {
+            name: "device".into(),
+            link: Arc::clone(&link),
+            unit_id: None,
+            timeout: TIMEOUT,
+            withdrawal: Arc::clone(&withdrawal),
+        };
         let rule = Rule {
             sources: vec!["127.0.0.0/8".parse().unwrap()],
             roles: None,
@@ -195,7 +202,7 @@ impl Setup {
             events: Verbosity::Nothing,
             audit: None,
         });
-        Setup { engine: engine.unwrap(), poller, link }
+        Setup { engine: engine.unwrap(), poller, link, withdrawal }
     }
 
     fn connect(&self) -> TcpStream {
@@ -340,6 +347,41 @@ fn a_master_that_has_gone_is_not_asked_for() {
     let asked = seen.requests.load(Ordering::Relaxed);
     assert_eq!(asked + setup.link.counters.withdrawn.get(), 160);
     assert!(asked < 120, "{asked} requests were sent");
+    setup.stop();
+}
+
+#[test]
+fn a_request_that_waits_for_a_device_that_was_taken_away_is_not_sent() {
+    let (address, held, asked) = held_device();
+    let setup = Setup::new(address);
+    let mut clients: Vec<_> = (0..3).map(|_| setup.connect()).collect();
+    let ask = |client: &mut TcpStream, request: &[u8]| {
+        let waiting = setup.link.waiting();
+        client.write_all(request).unwrap();
+        while setup.link.waiting() == waiting {
+            thread::yield_now();
+        }
+    };
+    let write = [&mbap::header(1, 1, 5)[..], &[6, 0, 200, 0, 1]].concat();
+    ask(&mut clients[0], &read(1, 100));
+    while asked.lock().unwrap().is_empty() {
+        thread::yield_now();
+    }
+    ask(&mut clients[1], &write);
+    ask(&mut clients[2], &read(1, 300));
+    setup.withdrawal.withdraw();
+    drop(held);
+
+    let expect = |client: &mut TcpStream, pdu: &[u8]| {
+        let mut reply = vec![0; mbap::HEADER_LEN + pdu.len()];
+        client.read_exact(&mut reply).unwrap();
+        assert_eq!(reply, [&mbap::header(1, 1, pdu.len())[..], pdu].concat());
+    };
+    expect(&mut clients[0], &registers(100));
+    expect(&mut clients[1], &[0x86, 0x0A]);
+    expect(&mut clients[2], &[0x83, 0x0A]);
+    assert_eq!(*asked.lock().unwrap(), [100], "only what was under way");
+    assert_eq!(setup.link.counters.withdrawn.get(), 2);
     setup.stop();
 }
 

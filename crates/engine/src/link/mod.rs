@@ -26,7 +26,7 @@ pub(crate) use limits::lease_fence::{Pass, submit_under};
 pub(crate) use limits::permit::{Permit, Wanted};
 pub(crate) use limits::standstill;
 pub(crate) use route::{Asker, Call, Receiver};
-pub use route::{LinkCounters, LinkSettings, Route, SharedLink};
+pub use route::{LinkCounters, LinkSettings, Route, SharedLink, Withdrawal};
 pub use scheduling::in_flight::InFlight;
 pub(crate) use scheduling::pending_reply::{PendingReply, Reply, ReplyTo, pending_reply};
 pub(crate) use scheduling::queue::{Priority, source};

@@ -2,7 +2,7 @@
 
 use std::future;
 use std::net::IpAddr;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
 use std::time::Duration;
 
@@ -66,7 +66,7 @@ counters! {
         coalesced,
         /// Answered by an earlier reply.
         cached,
-        /// Not sent, because the client had gone, or for a standstill.
+        /// Not sent, because the client or the device had gone, or for a standstill.
         withdrawn,
     }
 }
@@ -107,6 +107,8 @@ pub(super) struct Reply {
     pub(super) longest_wait: Duration,
     /// What its connection asks for after it waits for its end.
     in_order: Option<InOrder>,
+    /// Of its route; `None` for an event loop.
+    withdrawal: Option<Arc<Withdrawal>>,
     _place: Place,
 }
 
@@ -126,6 +128,21 @@ pub(crate) struct Asker {
     pub(crate) peer: Option<IpAddr>,
 }
 
+/// Of the routes to one device, before and after reloads: whether it was removed or changed.
+#[derive(Debug, Default)]
+pub struct Withdrawal(AtomicBool);
+
+impl Withdrawal {
+    /// What still waits for its turn is not sent any more, and gets 0A.
+    pub fn withdraw(&self) {
+        self.0.store(true, Ordering::Relaxed);
+    }
+
+    fn is_withdrawn(&self) -> bool {
+        self.0.load(Ordering::Relaxed)
+    }
+}
+
 /// Where the requests to a unit of a listener go.
 #[derive(Debug, Clone)]
 pub struct Route {
@@ -135,6 +152,7 @@ pub struct Route {
     /// The unit id of the device; `None` for that of the request.
     pub unit_id: Option<u8>,
     pub timeout: Duration,
+    pub withdrawal: Arc<Withdrawal>,
 }
 
 impl SharedLink {
@@ -211,7 +229,7 @@ impl SharedLink {
         let longest_wait = self.longest_wait();
         let to = Receiver::EventLoop(waiting.at_most(longest_wait));
         let (request, queued, source) = (request.clone(), time_since_boot(), caller.source);
-        let reply = Reply { to, longest_wait, in_order: None, _place: place };
+        let reply = Reply { to, longest_wait, in_order: None, withdrawal: None, _place: place };
         // If the link has ended, the call ends as lost.
         let _ = self.calls.send(Call { unit_id, request, queued, source, priority, reply });
         Some(ticket)
@@ -262,6 +280,7 @@ impl Route {
                 to: Receiver::Client(to),
                 longest_wait: self.timeout,
                 in_order: None,
+                withdrawal: Some(Arc::clone(&self.withdrawal)),
                 _place: place,
             },
         };
@@ -317,7 +336,13 @@ impl Reply {
     }
 
     pub(super) fn wanted(&self) -> Wanted {
-        self.to.wanted()
+        let wanted = self.to.wanted();
+        match self.withdrawal.clone() {
+            Some(withdrawal) => {
+                Arc::new(move |is_sent| !withdrawal.is_withdrawn() && wanted(is_sent))
+            }
+            None => wanted,
+        }
     }
 }
 

@@ -96,7 +96,7 @@ _LINK = object_of(
         "refused_down": COUNT,
         "coalesced": count("Ended with an identical read, answered or not"),
         "cached": count("Answered by an earlier reply"),
-        "withdrawn": count("Not sent: the client had gone, or after a standstill"),
+        "withdrawn": count("Not sent: the client or the device had gone, or after a standstill"),
         "waiting": COUNT,
         "unexpected_replies": count("Without a request"),
         "stray_bytes": count("Not part of an expected reply"),

@@ -47,6 +47,7 @@ class Devices(Part):
         self.passages: dict[str, _core.Passage] = {}
         """How services write to memories whose writes go to devices."""
         self._links: Mapping[str, _core.Link] = {}
+        self._withdrawals: Mapping[str, _core.Withdrawal] = {}
         self._polled: set[str] = set()
         self._events = DeviceEvents()
 
@@ -75,6 +76,11 @@ class Devices(Part):
         config = plan.config
         polled = {name for name, device in config.devices.items() if device.is_polled}
         poller, values, writes = self.poller, self.values, self.writes
+        withdrawals = {
+            name: withdrawal
+            for name, withdrawal in self._withdrawals.items()
+            if native_links.destination(config, name) == native_links.destination(self.config, name)
+        }
         if poller is None and (polled or config.links or routed(config) or config.nats is not None):
             self._began = time.monotonic()
             poller = _core.Poller([])
@@ -84,7 +90,7 @@ class Devices(Part):
                 values = TagValues(poller.receiver(), self._began)
                 writes = TagWrites(poller, self._audit.log, values.find)
             # The first use of an address decides the settings of its connection: links first.
-            plan.links = native_links.links(config, plan.memories, poller)
+            plan.links = native_links.links(config, plan.memories, poller, withdrawals)
         results = None if values is None else values.results
         made = {
             name: native_devices.device(name, plan, results, self._leases.fence(name, config))
@@ -94,6 +100,9 @@ class Devices(Part):
 
         def adopt() -> None:
             self.poller, self.values, self.writes = poller, values, writes
+            for name in self._withdrawals.keys() - withdrawals.keys():
+                self._withdrawals[name].withdraw()
+            self._withdrawals = plan.links.withdrawals
             replaced = made.keys() & self._polled
             if values is not None:
                 values.adopt(config, replaced)

@@ -8,14 +8,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from holdfast import _core
 from holdfast.client.endpoint import endpoint, receiver_endpoint
-from holdfast.client.url import Receiver
+from holdfast.client.url import Receiver, shared_connection
 from holdfast.config.checks.units import routed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from holdfast import _core
     from holdfast._core import Memory
     from holdfast.client.url import Target
     from holdfast.config import Config
@@ -30,6 +30,8 @@ class Links:
     """By name; a link without a name of its own has that of the first device behind it."""
     routes: dict[str, _core.Route] = field(default_factory=dict)
     """By the name of the link or device."""
+    withdrawals: dict[str, _core.Withdrawal] = field(default_factory=dict)
+    """The same: of these routes, and of those before whose devices stay."""
     passages: dict[str, _core.Passage] = field(default_factory=dict)
     """By the name of the memory."""
     waits: dict[_core.Link, float] = field(default_factory=dict)
@@ -40,7 +42,8 @@ class Links:
 
         A link that is in use already may have had another name before a reload.
         """
-        self.routes[name] = link.route(name, unit=unit, timeout=timeout)
+        own = self.withdrawals.setdefault(name, _core.Withdrawal())
+        self.routes[name] = link.route(name, unit=unit, timeout=timeout, withdrawal=own)
         if link not in self.waits:
             self.links[name] = link
         self.waits[link] = max(timeout, self.waits.get(link, 0.0))
@@ -53,13 +56,28 @@ class Links:
             link.set_longest_wait(wait)
 
 
-def links(config: Config, memories: Mapping[str, Memory], poller: _core.Poller) -> Links:
+def destination(config: Config, route: str) -> object:
+    """The device or line that the route of that name leads to, also if no listener uses it."""
+    if route in config.links:
+        return shared_connection(config.links[route].target)
+    device = config.devices.get(route)
+    return None if device is None else (shared_connection(device.target), device.unit)
+
+
+def links(
+    config: Config,
+    memories: Mapping[str, Memory],
+    poller: _core.Poller,
+    withdrawals: Mapping[str, _core.Withdrawal],
+) -> Links:
     """Creates all links, routes and passages. Raises `OSError` for unusable files.
+
+    `withdrawals` are those of routes in use whose devices stay.
 
     The first use of an address decides the settings of its connection, so links come first, and
     polled devices later.
     """
-    made = Links()
+    made = Links(withdrawals=dict(withdrawals))
     for name, settings in config.links.items():
         link = poller.link(
             endpoint_at(f"links.{name}.url", settings.target),

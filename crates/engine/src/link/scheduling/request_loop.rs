@@ -118,7 +118,7 @@ impl Serving {
             && matches!(**error, ClientError::Expired)
         {
             counters.withdrawn.add();
-            // After a standstill, a caller may still be there.
+            // After a standstill, or without its device, a caller may still be there.
             replies.retain(|reply| !reply.is_unwanted());
             let pdu = exception(request.pdu(), exception_code(error));
             return replies.into_iter().for_each(|reply| reply.send(Err((error, &pdu))));
