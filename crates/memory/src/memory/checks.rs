@@ -153,10 +153,12 @@ impl Content {
     }
 }
 
-/// Checks what [`write_across`](crate::write_across) checks before it takes the locks: everything but seals and journals.
+/// Checks what [`write_across`](crate::write_across) checks before it takes the locks: everything but
+/// seals and journals.
 ///
 /// # Errors
-/// As [`write_across`](crate::write_across), without [`Refusal::Sealed`], [`Refusal::Unsealed`] and [`Refusal::NotOneStep`].
+/// As [`write_across`](crate::write_across), without [`Refusal::Sealed`], [`Refusal::Unsealed`] and
+/// [`Refusal::NotOneStep`].
 pub fn check_across(access: Access, writes: &[(&Memory, Write<'_>)]) -> Result<(), Refused> {
     check_each(access, writes.iter().map(|(memory, write)| (*memory, write)), Ranges::Unreserved)
 }
