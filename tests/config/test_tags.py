@@ -297,7 +297,6 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
     ("name", "text", "expected"),
     [
         ("t.csv", "name,adress\nx,1\n", "t.csv:1: found the column 'adress', allowed: name, area"),
-        ("t.csv", "name,name\n", "t.csv:1: two columns have the name 'name'"),
         ("t.csv", "x,hr,1,,,,,,,,more\n", "t.csv:1: found 11 cells, allowed: up to 10"),
         (
             "t.csv",
@@ -335,6 +334,11 @@ def test_a_wrong_column_is_the_only_problem_of_its_file(tmp_path: Path) -> None:
     file = written(tmp_path, "name,area,adress\na,hr,1\nb,hr,2\n", "t.csv")
     [problem] = problems(file)
     assert problem.startswith("t.csv:1: found the column 'adress'")
+
+
+def test_a_column_that_occurs_twice_is_one_problem(tmp_path: Path) -> None:
+    file = written(tmp_path, "name,area,address,Address\na,hr,1,2\n", "t.csv")
+    assert problems(file) == ["t.csv:1: two columns have the name 'address'"]
 
 
 def test_one_entry_makes_many_devices(tmp_path: Path) -> None:

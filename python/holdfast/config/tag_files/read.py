@@ -169,7 +169,7 @@ def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:
 def _columns(table: _Table, line: int, cells: list[str]) -> list[str]:
     known = (*COLUMNS, *MORE_COLUMNS)
     columns = [cell.lower() for cell in cells]
-    for column in columns:
+    for column in dict.fromkeys(columns):
         if column not in known:
             words = f"found the column {show(column)}, allowed: {listing(known)}"
             table.refuse(line, f"{words}{suggestion(column, known)}")
