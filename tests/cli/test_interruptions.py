@@ -17,7 +17,7 @@ from holdfast.cli.signals import (
     interruptions,
     keep_hangups,
 )
-from support.cli import answer, invoke
+from support.cli import answer, failure, invoke
 from support.fake_device import FakeDevice
 
 if TYPE_CHECKING:
@@ -119,23 +119,32 @@ def test_a_command_that_is_interrupted_says_so(monkeypatch: pytest.MonkeyPatch) 
     )
 
 
+@pytest.mark.parametrize(
+    ("words", "places"),
+    [
+        (("hr", "3", "1"), "holding_registers 3 was"),
+        (("co", "3", "1", "0"), "coils 3 to 4 were"),
+        (("hr", "3", "1.5", "--type", "float32"), "holding_registers 3 to 4 were"),
+        (("file:4:7", "1"), "file 4 record 7 was"),
+        (("file:4:7", "1", "2"), "file 4 records 7 to 8 were"),
+    ],
+)
 def test_a_write_that_is_interrupted_was_possibly_carried_out(
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], places: str
 ) -> None:
     def interrupted(*_arguments: object, **_more: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(SyncClient, "write", interrupted)
+    monkeypatch.setattr(SyncClient, "write_file_record", interrupted)
     url = "tcp://127.0.0.1:1"
-    write = ("write", url, "hr", "3", "1")
-    result = invoke(*write)
-    assert result.output.splitlines() == [
+    write = ("write", url, *words)
+    assert failure(*write) == [
         f"holdfast: {url}: interrupted",
-        "hint: holding_registers was possibly written",
+        f"hint: {places} possibly written",
     ]
-    result = invoke(*write, "--json")
-    found = json.loads(result.output)
-    assert (result.exit_code, found["ok"], found["reason"]) == (1, False, "interrupted")
+    found = answer(*write, code=1)
+    assert (found["ok"], found["reason"]) == (False, "interrupted")
     assert (found["target"], found["maybe_written"]) == (url, True)
 
 

@@ -181,7 +181,9 @@ def _carry_out(
             # It is not known how much of a split write Ctrl-C has left.
             written = {"written": found.written} if isinstance(found, ModbusError) else {}
             shown = {**fields, **written, "maybe_written": maybe}
-            first = f"{job.where} was possibly written" if maybe else None
+            done = written.get("written", 0)
+            verb = "was" if fields["count"] == done + 1 else "were"
+            first = f"{job.places(done)} {verb} possibly written" if maybe else None
             device_errors.fail(
                 error, url, shown, first, is_in_area=isinstance(job, _Job), is_write=True
             )
@@ -269,12 +271,15 @@ class _FileJob:
         """What is numbered."""
         return f"file {self.file} record"
 
+    def places(self, done: int = 0) -> str:
+        """The records as text, without the first `done`."""
+        first, last = self.record + done, self.record + len(self.values) - 1
+        return f"{self.where} {last}" if first == last else f"{self.where}s {first} to {last}"
+
     @property
     def summary(self) -> str:
         """The result as text."""
-        last = self.record + len(self.values) - 1
-        where = f" {last}" if last == self.record else f"s {self.record} to {last}"
-        return f"Written: {self.where}{where}, 1 request"
+        return f"Written: {self.places()}, 1 request"
 
     def to_json(self) -> dict[str, object]:
         """The job for JSON."""
@@ -306,13 +311,17 @@ class _Job:
         """What is numbered."""
         return self.place.area
 
+    def places(self, done: int = 0) -> str:
+        """The addresses as text, without the first `done`."""
+        first = self.place.address + done
+        last = self.place.address + self.typed.registers - 1
+        return f"{self.where} {first}" if first == last else f"{self.where} {first} to {last}"
+
     @property
     def summary(self) -> str:
         """The result as text."""
-        first, count = self.place.address, self.typed.registers
-        where = f"{first}" if count == 1 else f"{first} to {first + count - 1}"
         requests = terminal_text.counted(len(self.requests), "request")
-        return f"Written: {self.where} {where}, {requests}"
+        return f"Written: {self.places()}, {requests}"
 
     def to_json(self) -> dict[str, object]:
         """The job for JSON."""
