@@ -104,21 +104,6 @@ def test_handlers_are_as_before_when_the_command_ends() -> None:
             signal.signal(number, handler)
 
 
-def test_a_command_that_is_interrupted_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(*_arguments: object, **_more: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(SyncClient, "read", interrupted)
-    read = ("read", "tcp://127.0.0.1:1", "hr", "0")
-    result = invoke(*read)
-    assert (result.exit_code, result.output) == (1, "holdfast: interrupted\n")
-    result = invoke(*read, "--json")
-    assert (result.exit_code, json.loads(result.output)) == (
-        1,
-        {"ok": False, "reason": "interrupted", "detail": "interrupted"},
-    )
-
-
 @pytest.mark.parametrize(
     ("words", "places"),
     [
@@ -159,6 +144,23 @@ def heard() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("heard")
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("read", ("hr", "0")), ("describe guess", ("hr", "0")), ("describe identify", ())],
+)
+def test_a_command_that_is_interrupted_says_so(name: str, words: tuple[str, ...]) -> None:
+    with FakeDevice(lambda _: signal.raise_signal(signal.SIGINT)) as device:
+        command = (*name.split(), device.url, *words, "--timeout", "60")
+        assert failure(*command) == ["holdfast: interrupted"]
+        assert answer(*command, code=1) == {
+            "ok": False,
+            "target": device.url,
+            "reason": "interrupted",
+            "detail": "interrupted",
+        }
 
 
 @pytest.mark.usefixtures("heard")
@@ -226,6 +228,7 @@ def test_a_replay_that_is_interrupted_fails(
         result = invoke(*replay, "--json")
         found = json.loads(result.stdout)
         assert (result.exit_code, found["ok"], found["reason"]) == (1, False, "interrupted")
+        assert found["target"] == str(config)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -13,6 +13,17 @@ if TYPE_CHECKING:
 TARGETS = ("url", "target", "targets", "receiver", "fleet", "file", "files")
 """The parameters of commands that say what they talk to."""
 
+_COMMAND = f"{__name__}.command"
+"""The place in `meta` of the context of the command that has `--json`."""
+
+
+def note_wanted(context: click.Context, _: click.Parameter, as_json: bool) -> bool:
+    """Takes the value of `--json`. The context is kept: an interruption ends it, and is told after
+    that."""
+    if as_json:
+        context.meta[_COMMAND] = context
+    return as_json
+
 
 def wanted() -> bool:
     """Whether the command that runs has `--json`."""
@@ -40,7 +51,7 @@ def first_of(errors: Mapping[str, Mapping[str, object]]) -> dict[str, object]:
 
 def _target() -> str | None:
     context = click.get_current_context(silent=True)
-    given = {} if context is None else context.params
+    given = {} if context is None else context.meta.get(_COMMAND, context).params
     for name in TARGETS:
         if given.get(name):
             value = given[name]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from holdfast.cli import answers
 from holdfast.runtime.text import clip, listing, suggestion
 
 if TYPE_CHECKING:
@@ -38,10 +39,10 @@ def option(
     return click.option(*names.split(), type=type, metavar=metavar, help=help, **more)
 
 
-def flag(names: str, help: str, default: bool = False) -> Callable[[Command], Command]:
+def flag(names: str, help: str, default: bool = False, **more: Any) -> Callable[[Command], Command]:
     """Adds an option without a value. The help shows a default that is `True`."""
     return click.option(
-        *names.split(), is_flag=True, default=default, show_default=default, help=help
+        *names.split(), is_flag=True, default=default, show_default=default, help=help, **more
     )
 
 
@@ -93,7 +94,7 @@ def file_option(names: str, help: str, type: click.Path = FILE) -> Callable[[Com
     return option(names, "FILE", help, type)
 
 
-json_option = flag("--json as_json", "Print JSON for programs.")
+json_option = flag("--json as_json", "Print JSON for programs.", callback=answers.note_wanted)
 
 
 def schema_option(help: str, schema: Callable[[], object]) -> Callable[[Command], Command]:
