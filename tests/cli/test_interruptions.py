@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
+import subprocess
 import sys
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +19,7 @@ from holdfast.cli.signals import (
     interruptions,
     keep_hangups,
 )
+from support import wire
 from support.cli import answer, failure, invoke
 from support.fake_device import FakeDevice
 
@@ -131,6 +134,38 @@ def test_a_write_that_is_interrupted_was_possibly_carried_out(
     found = answer(*write, code=1)
     assert (found["ok"], found["reason"]) == (False, "interrupted")
     assert (found["target"], found["maybe_written"]) == (url, True)
+
+
+STOPS = """
+import signal
+from functools import partial
+from holdfast.cli.signals import stops
+say = partial(partial, print, flush=True)
+signal.signal(signal.SIGTSTP, signal.SIG_DFL)
+for _ in range(2):
+    with stops(say("keys left"), say("keys")), stops(say("screen left"), say("screen")):
+        signal.raise_signal(signal.SIGTSTP)
+print(signal.getsignal(signal.SIGTSTP) == signal.SIG_DFL)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGTSTP")
+def test_ctrl_z_stops_after_the_modes_of_the_terminal_are_left(tmp_path: Path) -> None:
+    output = tmp_path / "output"
+    left, entered = ["screen left", "keys left"], ["keys", "screen"]
+    with output.open("w") as file:
+        # A group of its own: SIGTSTP does not stop an orphaned one.
+        process = subprocess.Popen([sys.executable, "-c", STOPS], stdout=file, process_group=0)
+    try:
+        for shown in (left, [*left, *entered, *left]):
+            assert os.WIFSTOPPED(os.waitpid(process.pid, os.WUNTRACED)[1])
+            assert output.read_text().splitlines() == shown
+            process.send_signal(signal.SIGCONT)
+        assert process.wait(wire.DEADLINE) == 0
+        assert output.read_text().splitlines() == [*left, *entered, *left, *entered, "True"]
+    finally:
+        process.kill()
+        process.wait()
 
 
 @pytest.fixture

@@ -421,6 +421,19 @@ def test_a_signal_leaves_the_terminal_as_it_was(
     assert terminal.shown.endswith("\x1b[?25h\x1b[?1049l")
 
 
+def test_ctrl_z_leaves_the_screen_until_the_view_continues(server: holdfast.Server) -> None:
+    # Without a shell that could continue it, the process is not stopped, but continues at once.
+    with Terminal("watch", cli.url(server), "hr", "0", "--every", "1h") as terminal:
+        terminal.until("q quits")
+        terminal.wait_for_enter()
+        terminal.keys("\x1a")
+        terminal.until("q quits")
+        terminal.keys("q")
+        assert terminal.end() == 0
+    modes = re.findall(r"\x1b\[\?(1049.|25.)", terminal.shown)
+    assert modes == ["1049h", "25l", "1049l", "25h", "1049h", "25l", "25h", "1049l"]
+
+
 @pytest.mark.parametrize("kind", ["dumb", "unknown"])
 @pytest.mark.parametrize("words", [("hr", "0"), ("hr:0", "hr:1")])
 def test_a_terminal_that_redraws_nothing_gets_lines(

@@ -12,6 +12,7 @@ import signal
 import struct
 import termios
 import time
+import tty
 from typing import TYPE_CHECKING
 
 from support import wire
@@ -73,6 +74,12 @@ class Terminal:
 
     def keys(self, keys: str) -> None:
         os.write(self._own, keys.encode())
+
+    def wait_for_enter(self) -> None:
+        """Lets the terminal pass on whole lines only, as it does for a shell."""
+        modes = termios.tcgetattr(self._own)
+        modes[tty.LFLAG] |= termios.ICANON
+        termios.tcsetattr(self._own, termios.TCSANOW, modes)
 
     def resize(self, lines: int, columns: int) -> None:
         self._resize(lines, columns)

@@ -1,14 +1,15 @@
-"""The signals that end a service, or make it reread its configuration."""
+"""The signals that end a service, make it reread its configuration, or stop a view for a while."""
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from types import FrameType
 
 
@@ -153,6 +154,34 @@ def stops_as_ctrl_c() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def stops(before: Callable[[], None], after: Callable[[], None]) -> Iterator[None]:
+    """Lets Ctrl-Z call `before` and then stop the process, and calls `after` when it continues.
+
+    For modes of the terminal, which the shell needs as they were. Those inside come first.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        before()
+        if callable(outer):
+            outer(number, frame)
+        else:
+            signal.signal(number, outer)
+            # Not `os.kill`, whose signal another thread may take, later.
+            signal.raise_signal(number)
+        signal.signal(number, stop)
+        after()
+
+    outer = signal.signal(signal.SIGTSTP, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTSTP, outer)
 
 
 def _has_terminal() -> bool:

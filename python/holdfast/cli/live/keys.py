@@ -9,6 +9,8 @@ import sys
 import time
 from typing import TYPE_CHECKING, TypeAlias
 
+from holdfast.cli.signals import stops
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
@@ -31,11 +33,19 @@ def keys() -> Iterator[Wait]:
 
         terminal = sys.stdin.fileno()
         before = termios.tcgetattr(terminal)
-        try:
+
+        def take() -> None:
             tty.setcbreak(terminal)
-            yield lambda seconds: _posix(terminal, seconds)
-        finally:
+
+        def leave() -> None:
             termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+        with stops(leave, take):
+            try:
+                take()
+                yield lambda seconds: _posix(terminal, seconds)
+            finally:
+                leave()
 
 
 def _nothing(seconds: float) -> str:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import contextlib
 import math
+import os
 import re
 import time
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING
 
-from rich.console import Console, Group
+from rich.console import Console, ConsoleDimensions, Group
+from rich.control import Control
 from rich.live import Live
 from rich.text import Text
 
 from holdfast.cli import terminal_text
 from holdfast.cli.live import keys, schedule
+from holdfast.cli.signals import stops
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -77,7 +80,12 @@ class Screen(ABC):
 
     def run(self, times: int | None) -> None:
         """Shows readings until q or Ctrl-C. The first one has been read before."""
-        with contextlib.suppress(Quit, KeyboardInterrupt), keys.keys() as wait, self._live:
+        with (
+            contextlib.suppress(Quit, KeyboardInterrupt),
+            keys.keys() as wait,
+            self._live,
+            stops(lambda: self._switch(False), lambda: self._switch(True)),
+        ):
             self._wait = wait
             for tick in schedule.ticks(self._every, times, self._pause):
                 if tick:
@@ -99,6 +107,13 @@ class Screen(ABC):
             self._page = max(0, min(self._page + TURNS.get(key, 0), self._pages - 1))
         if pressed or self._console.size != self._size:
             self._draw()
+
+    def _switch(self, is_shown: bool) -> None:
+        """Switches to the screen, or back to that of the shell. May interrupt the output of Rich,
+        so it does without."""
+        codes = f"{Control.alt_screen(is_shown)}{Control.show_cursor(not is_shown)}"
+        os.write(self._console.file.fileno(), codes.encode())
+        self._size = ConsoleDimensions(0, 0)  # Redraws soon, as for a new size.
 
     def _draw(self) -> None:
         self._drawn = time.monotonic()
