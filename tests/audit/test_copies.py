@@ -169,7 +169,7 @@ def test_lines_wait_for_a_receiver_that_is_down(
     wire.until(lambda: caplog.messages == [*outage, "audit_copy_failed"], "so is the next outage")
 
 
-@pytest.mark.parametrize(("back_after", "is_back"), [(3600.0, []), (0.0, ["audit_copies_back"])])
+@pytest.mark.parametrize(("back_after", "is_back"), [(3600.0, []), (0.3, ["audit_copies_back"])])
 def test_nobody_who_listens_over_udp_is_logged_once(
     udp: socket.socket,
     audit: Callable[..., Audit],
@@ -178,6 +178,7 @@ def test_nobody_who_listens_over_udp_is_logged_once(
     back_after: float,
     is_back: list[str],
 ) -> None:
+    """The end of the outage is logged without another line."""
     monkeypatch.setattr(copies, "BACK_AFTER_S", back_after)
     caplog.set_level("INFO")
     address = udp.getsockname()
@@ -187,6 +188,30 @@ def test_nobody_who_listens_over_udp_is_logged_once(
     await_counts(log, "syslog", waiting=0)
     assert counts(log, "syslog")["failed"] > 1
     wire.until(lambda: caplog.messages == ["audit_copy_failed", *is_back], "it is logged")
+
+
+def test_a_syslog_receiver_that_resets_each_connection_is_logged_once(
+    audit: Callable[..., Audit],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """As a load balancer without a receiver behind it: the first line of a connection is sent."""
+    monkeypatch.setattr(copies, "BACK_AFTER_S", 3600.0)
+    caplog.set_level("INFO")
+    attempts = iter(range(10**6))
+
+    def transmit(_connection: socket.socket, _line: bytes) -> None:
+        if (attempt := next(attempts)) % 2 == 0:
+            raise ConnectionResetError("reset") if attempt % 4 else BrokenPipeError("broken")
+
+    receiver = Syslog("tcp", ("127.0.0.1", 9))
+    monkeypatch.setattr(receiver, "_connect", socket.socket)
+    monkeypatch.setattr(receiver, "_transmit", lambda *each: transmit(*each))
+    log = audit(Copies("syslog", receiver))
+    for number in range(10):
+        log.write(number=number)
+        await_counts(log, "syslog", sent=number + 1, waiting=0)
+    assert caplog.messages == ["audit_copy_failed", "audit_copy_failed"]  # Each reason.
 
 
 def test_lines_that_find_no_room_are_dropped_counted_and_logged(

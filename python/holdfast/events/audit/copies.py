@@ -26,7 +26,8 @@ RETRY_DELAY_S = 1.0
 """Seconds before a line is sent again."""
 
 BACK_AFTER_S = 5.0
-"""Seconds without a failure before an outage of a receiver that `reports_late` is over."""
+"""Seconds without a failure, from the first line that is sent again, before an outage of a receiver
+that `reports_late` is over."""
 
 LOST_INTERVAL_S = 60.0
 """Interval of logging that lines were dropped."""
@@ -39,8 +40,8 @@ class Receiver(Protocol):
     """Where copies go."""
 
     reports_late: bool
-    """Whether a line that does not arrive can be sent, and the next one fails, as over UDP: lines
-    to a port where nobody listens succeed and fail by turns."""
+    """Whether a line that does not arrive can be sent, and the next one fails: lines to a UDP port
+    where nobody listens succeed and fail by turns, as over TCP if each connection is reset."""
 
     def send(self, line: bytes) -> None:
         """Sends a line without its line feed. Raises `OSError`; the next call tries anew."""
@@ -61,9 +62,10 @@ class Copies:
         self._logged, self._logged_at = 0, -inf
         """The dropped lines that were logged, and when."""
         self._closing = False
-        self._error: str | None = None
-        """Why the receiver is down."""
-        self._failed_at = -inf
+        self._reasons: set[str] = set()
+        """Why the receiver is down: all that were logged in this outage."""
+        self._back_at = inf
+        """When the outage is over, unless a line fails before; infinite until one was sent."""
         self._change = threading.Condition()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"holdfast-{name}", daemon=True)
@@ -117,10 +119,19 @@ class Copies:
 
     def _next(self) -> bytes | None:
         """The first line that waits; `None` after the last, and when it is too late."""
-        with self._change:
-            while not self._waiting and not self._closing:
-                self._change.wait()
-            return self._waiting[0] if self._waiting and not self._closed.is_set() else None
+        while True:
+            left = self._back_at - time.monotonic()
+            with self._change:
+                if not self._waiting and not self._closing and left > 0:
+                    self._change.wait(None if left == inf else left)
+                line = self._waiting[0] if self._waiting else None
+                is_end = self._closing
+            if line is None and left <= 0:
+                self._reasons.clear()
+                self._back_at = inf
+                log_lines.write(logging.INFO, "audit_copies_back", receiver=self.name)
+            if line is not None or is_end:
+                return None if self._closed.is_set() else line
 
     def _note(self, error: OSError | None) -> None:
         """Counts an attempt.
@@ -135,23 +146,18 @@ class Copies:
             self._logged += too_long
             if (error is None or too_long) and self._waiting:
                 self._size -= len(self._waiting.popleft())
-            is_empty = not self._waiting
         if error is not None:
             # Each line that is lost, and each new reason of an outage.
-            if too_long or str(error) != self._error:
+            if too_long or str(error) not in self._reasons:
                 log_lines.problem("audit_copy_failed", receiver=self.name)
             if not too_long:
-                self._error, self._failed_at = str(error), time.monotonic()
+                self._reasons.add(str(error))
+                self._back_at = inf
                 self._closed.wait(RETRY_DELAY_S)
-        elif self._error is not None and is_empty and self._is_proven():
-            self._error = None
-            log_lines.write(logging.INFO, "audit_copies_back", receiver=self.name)
+        elif self._reasons and self._back_at == inf:
+            late = BACK_AFTER_S if self._receiver.reports_late else 0.0
+            self._back_at = time.monotonic() + late
         self._log_lost(LOST_INTERVAL_S)
-
-    def _is_proven(self) -> bool:
-        """Whether a line that was sent shows that the receiver is up."""
-        late = BACK_AFTER_S if self._receiver.reports_late else 0.0
-        return time.monotonic() >= self._failed_at + late
 
     def _log_lost(self, every: float) -> None:
         """Logs how many lines were dropped, once in some seconds."""

@@ -74,7 +74,7 @@ class Syslog(_SocketReceiver):
     ) -> None:
         """`target`: host and port, or the path of a Unix socket."""
         self._transport = transport
-        self.reports_late = transport == "udp"
+        self.reports_late = transport != "unix"
         self._target = target
 
     def _transmit(self, connection: socket.socket, line: bytes) -> None:
