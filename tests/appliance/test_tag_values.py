@@ -17,6 +17,7 @@ from holdfast.adapters.metrics.families import tag_metrics
 from holdfast.appliance import Appliance
 from holdfast.appliance.parts import tag_values
 from holdfast.appliance.parts.tag_values import TagValues
+from holdfast.appliance.services import outputs
 from holdfast.appliance.services.supervision import Supervisor
 from holdfast.config import load
 from holdfast.events import log_lines
@@ -261,6 +262,41 @@ def test_values_that_are_lost_at_the_end_of_an_output_are_logged(
         assert len(logged) == is_removed
     [record] = [each for each in caplog.records if each.message == "output_unsent"]
     assert vars(record)["fields"]["count"] >= 4
+
+
+@pytest.mark.parametrize("is_removed", [False, True])
+def test_values_of_an_output_that_never_starts_again_are_logged_as_lost(
+    tmp_path: Path,
+    device: int,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+    is_removed: bool,
+) -> None:
+    """At the end of the program, or when a reload removes it."""
+
+    def fail(*_: object) -> Any:
+        raise OSError("can't be opened")
+
+    def logged() -> list[int]:
+        found = [each for each in caplog.records if each.message == "output_unsent"]
+        return [vars(each)["fields"]["count"] for each in found]
+
+    made = settings(device)
+    made["outputs"]["down"] = {"type": "influx", "url": "http://127.0.0.1:9", "bucket": "b"}
+    with Appliance(load(saved(tmp_path, made))) as appliance:
+        status = appliance.diagnostics.adapter
+        wire.until(lambda: (status("output/down") or {}).get("waiting") == 4, "all wait")
+        monkeypatch.setattr(outputs, "receiver", fail)
+        made["outputs"]["down"]["bucket"] = "other"
+        appliance.reload(load(saved(tmp_path, made)))
+        wire.until(lambda: (status("output/down") or {}).get("state") == "failed", "it fails")
+        assert logged() == []
+        if is_removed:
+            del made["outputs"]["down"]
+            appliance.reload(load(saved(tmp_path, made)))
+            assert len(logged()) == 1
+    [count] = logged()
+    assert count >= 4
 
 
 def test_a_reload_changes_tags_and_outputs_and_loses_nothing(

@@ -196,7 +196,7 @@ def test_a_frozen_server_does_not_hold_up_a_stop(
     monkeypatch.setattr(output_module, "CONFIRM_TIMEOUT_S", 3600.0)
     output = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")
     buffer, stop = Buffer(), Stop()
-    sending = Sending("nats", output, buffer)
+    sending = Sending("nats", output, buffer, is_followed=lambda: True)
     thread = threading.Thread(target=sending.run, args=[stop])
     thread.start()
     buffer.offer(polls(1))

@@ -360,6 +360,7 @@ def test_a_buffer_keeps_what_waits_for_the_next_output() -> None:
     output.receiver.error = OSError("down")
     output.buffer.offer(polls(5))
     wire.until(lambda: output.receiver.attempts > 0, "it is tried")
+    output.sending._is_followed = lambda: True
     output.end()
     output.receiver, output.stop = Fake(), Stop()
     output.start()
@@ -380,6 +381,7 @@ def test_two_outputs_never_share_a_buffer() -> None:
     before.buffer.offer(polls(3))
     try:
         wire.until(lambda: before.receiver.attempts, "it is tried")
+        before.sending._is_followed = lambda: True
         before.stop.set()
         second, third = Running(buffer=before.buffer), Running(buffer=before.buffer)
         second.end()

@@ -9,6 +9,6 @@ from __future__ import annotations
 
 from holdfast.outputs.buffer import Buffer
 from holdfast.outputs.changes import Changes
-from holdfast.outputs.sending import Receiver, Refused, Sending
+from holdfast.outputs.sending import Receiver, Refused, Sending, log_unsent
 
-__all__ = ["Buffer", "Changes", "Receiver", "Refused", "Sending"]
+__all__ = ["Buffer", "Changes", "Receiver", "Refused", "Sending", "log_unsent"]

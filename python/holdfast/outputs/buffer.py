@@ -85,6 +85,12 @@ class Buffer:
             self._put_back(*before._pop_all())
             self._drop(before.dropped - self._dropped_before)
 
+    def clear(self) -> None:
+        """Drops what is in memory. It is not counted as dropped: the end of the output logs it."""
+        self._pop_all()
+        if not self._is_batch_stored:
+            self._batch = []
+
     def _pop_all(self) -> list[Sequence[Reading]]:
         with self._changed:
             polls = [*self._waiting]

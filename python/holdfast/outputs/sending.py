@@ -87,6 +87,25 @@ def soon_after(stop: Stop, end: Callable[[], None]) -> None:
     stop.then(begin)
 
 
+def log_unsent(name: str, buffer: Buffer) -> None:
+    """Logs what is lost at the end of an output, if no `Sending` runs that does so at its own end.
+
+    Its receiver may have failed, or never have been made.
+    """
+    if buffer.in_use.acquire(blocking=False):
+        try:
+            buffer.take_over()
+            _log_count(name, len(buffer))
+            buffer.clear()
+        finally:
+            buffer.in_use.release()
+
+
+def _log_count(name: str, unsent: int) -> None:
+    if unsent > 0:
+        log_lines.write(logging.WARNING, "output_unsent", output=name, count=unsent)
+
+
 class Sending:
     """An adapter that sends what is in a buffer to a receiver.
 
@@ -267,15 +286,15 @@ class Sending:
         self._keep(STORE_TIMEOUT_S)
         self._log_dropped(0.0)
         self._log_unsent()
+        if not self._is_followed():
+            self._buffer.clear()
 
     def _log_unsent(self) -> None:
         """Logs what is lost."""
         stored = self._buffer.stored
         in_file = 0 if stored is None else stored.count
         kept = in_file if stored is not None and stored.is_in_place else 0
-        unsent = (in_file if self._is_followed() else len(self._buffer)) - kept
-        if unsent > 0:
-            log_lines.write(logging.WARNING, "output_unsent", output=self._name, count=unsent)
+        _log_count(self._name, (in_file if self._is_followed() else len(self._buffer)) - kept)
 
     def _use_file(self) -> None:
         """Opens the file, or tries again after an error."""

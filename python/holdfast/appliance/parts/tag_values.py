@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from holdfast.client.url import NetworkTarget
 from holdfast.config.models.devices import DeviceIdentityConfig
 from holdfast.events import log_lines
-from holdfast.outputs import Buffer, Changes, Sending
+from holdfast.outputs import Buffer, Changes, Sending, log_unsent
 from holdfast.outputs.device_access import DeviceInfo
 from holdfast.outputs.line_protocol import has_field
 from holdfast.polling import Reading
@@ -149,10 +149,12 @@ class TagValues:
             self._ending.set()
 
     def join(self, timeout: float) -> None:
-        """Waits for the thread, which ends with the poller."""
+        """Waits for the thread, which ends with the poller. Called after the end of all outputs."""
         self.stop()
         if self._thread.ident is not None:
             self._thread.join(timeout)
+        for name, output in self._outputs.items():
+            log_unsent(name, output.buffer)
 
     def adopt(self, config: Config, replaced: Collection[str] = ()) -> None:
         """Takes over devices and outputs. Outputs keep what they have to send.
@@ -195,7 +197,10 @@ class TagValues:
                 known.buffer.most = settings.buffer.values
                 known.changes.forget(changed)
                 outputs[name] = known
+            gone = {name: self._outputs[name] for name in self._outputs.keys() - outputs.keys()}
             self._outputs = outputs
+        for name, output in gone.items():
+            log_unsent(name, output.buffer)
 
     def have_begun(self, replaced: Collection[str]) -> None:
         """Takes polls of these devices again: they are those of the new configuration."""
