@@ -1089,6 +1089,9 @@ def test_an_octal_number_is_refused(imported: Callable[..., Imported], above: st
             imported(f"sensors: [{{name: a, address: 1, nan_value: {number}}}]", hub)
     quoted = imported("sensors: [{name: a, slave: 1, address: '0_100'}]", hub)
     assert tags(quoted)["a"]["address"] == 100
+    for name in ("!!str 0_17", "! 0_17", "|-\n        0_17", "!!str 0100"):
+        text = imported(f"sensors:\n    - address: 1\n      name: {name}\n", hub)
+        assert list(tags(text)) == [name.split()[-1]]
     with pytest.raises(ConfigError, match="line hidden, as it may contain a secret"):
         imported("password: a: hunter2", hub)
 

@@ -146,8 +146,10 @@ class Source:
         elif type(value) is int or (self._has_underscores and isinstance(value, str)):
             place = self.desk.document.place(path)
             found = _OTHER_BASE.match(self._line(place.file, place.line), place.column - 1)
+            if found is None:
+                return
             # With underscores, it is text here, and numbers are also read from text.
-            if found is None or (isinstance(value, str) and value != found[1]):
+            if isinstance(value, str) and (value != found[1] or self.desk.document.is_text(path)):
                 return
             digits = found[1].replace("_", "")
             base, name = (2, "binary") if "b" in digits else (8, "octal")

@@ -93,6 +93,8 @@ class _Spot:
     children: dict[Key, tuple[Place, _Spot]] = field(default_factory=dict)
     kind: _Kind = _Kind.MAPPING
     values: int = 1
+    is_text: bool = False
+    """Whether a scalar is text whatever it holds: in quotes, in a block, or with the tag `str`."""
 
 
 _NO_CHILDREN: Final[dict[Key, tuple[Place, _Spot]]] = {}
@@ -125,12 +127,20 @@ class Document:
 
     def holds(self, path: KeyPath) -> bool:
         """Whether there is a value at `path`."""
+        return self._spot(path) is not None
+
+    def is_text(self, path: KeyPath) -> bool:
+        """Whether there is a scalar at `path` that is text whatever it holds, as with quotes."""
+        spot = self._spot(path)
+        return spot is not None and spot.is_text
+
+    def _spot(self, path: KeyPath) -> _Spot | None:
         spot = self.root
         for part in path:
             if part not in spot.children:
-                return False
+                return None
             spot = spot.children[part][1]
-        return True
+        return spot
 
     def inside(self, *keys: Key) -> Document:
         """A document that has this one at the path of these keys."""
@@ -335,7 +345,8 @@ class _Reader:
                 return self._included(event, path, data)
             empty = text == "" and what == "plain"
             form = _Kind.EMPTY if empty else _Kind.SCALAR
-            return data, _Spot(self._place(event), _NO_CHILDREN, form)
+            is_text = kind in ("!", "str")
+            return data, _Spot(self._place(event), _NO_CHILDREN, form, is_text=is_text)
         value = self._list(event, path) if what == "list" else self._mapping(event, path)
         if tag in (None, "!", f"{_TAG}seq" if what == "list" else f"{_TAG}map"):
             return value
