@@ -164,6 +164,15 @@ def test_values_of_another_type_are_refused(value: Any, kind: str) -> None:
         values.encode(value, kind)
 
 
+@pytest.mark.parametrize(
+    ("value", "found"),
+    [(numpy.int64(2**62 + 1), "4611686018427387905"), (numpy.float64(1e6), "1000000.0")],
+)
+def test_a_number_that_is_refused_is_shown_as_it_was_given(value: Any, found: str) -> None:
+    with pytest.raises(DoesNotFit, match=f"^{found} is outside"):
+        values.encode(value, "float16")
+
+
 def test_a_finite_number_too_large_for_a_float_is_refused() -> None:
     large = numpy.finfo(numpy.longdouble).max
     # Where numpy has no floats with more bits, float32 is too small all the same.

@@ -20,7 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast import values
-from holdfast.values import ConversionError, codec_for, decode, encode, register_count
+from holdfast.values import ConversionError, codec_for, decode, encode, numeric, register_count
 from holdfast.values.integers import as_boolean
 from holdfast.values.orders import SWAPPED_BYTES
 from holdfast.values.types import parsed
@@ -711,6 +711,12 @@ def test_a_number_with_more_digits_than_a_float_is_rounded_once(name: str, step:
             assert decode(encode([0.5, sign * value], f"{name}[2]"), f"{name}[2]")[1] == (
                 sign * nearest
             )
+
+
+def test_numbers_that_a_float_holds_are_packed_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numeric.Float, "pack_one", None)
+    for most in (2**53, -(2**53)):
+        assert decode(encode([1, 2.5, most], "float32[3]"), "float32[3]") == [1.0, 2.5, most]
 
 
 def test_an_integer_may_be_of_any_library() -> None:

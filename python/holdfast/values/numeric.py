@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from abc import abstractmethod
 from math import inf, isinf, nextafter
@@ -18,6 +19,7 @@ from holdfast.values.types import FIXED
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from fractions import Fraction
 
     from holdfast.values.orders import Order
     from holdfast.values.types import Type
@@ -28,6 +30,9 @@ MAX = {
     "float32": 3.4028234663852886e38,
     "float64": 1.7976931348623157e308,
 }
+
+MAX_EXACT = 1 << 53
+"""The integers up to this one are floats too."""
 
 
 def limits(base: str) -> tuple[float, float]:
@@ -41,15 +46,15 @@ def limits(base: str) -> tuple[float, float]:
     return least, least + (1 << 8 * size) - 1
 
 
-def nearest_float(number: float, base: str) -> float:
+def nearest_float(number: float | Fraction, base: str) -> float:
     """The nearest number of a floating-point type. Raises `OverflowError` beyond the type."""
     form = f">{FLOATS[base]}"
     # Of an integer beyond the type, `struct` has an error of its own.
-    found: float = struct.unpack(form, struct.pack(form, _float_for(number, base)))[0]
+    found: float = struct.unpack(form, struct.pack(form, float_for(number, base)))[0]
     return found
 
 
-def _float_for(number: Any, base: str) -> float:
+def float_for(number: Any, base: str) -> float:
     """The float that `struct` rounds to the nearest number of a type.
 
     Rounded to 53 bits and then to fewer, a number can become the one that is second nearest. This
@@ -88,25 +93,25 @@ class Number(Kind):
 
     def pack_one(self, value: Any) -> bytes:
         """The bytes of a number. Raises `DoesNotFit`."""
-        number = value
         try:
-            if type(value) not in self.plain:
-                number = self._number(value)
+            number = value if type(value) in self.plain else self._number(value)
             data = self._one.pack(number)
         except (struct.error, OverflowError):
-            found = value if type(value) is int else number
-            raise _outside(found, self._least, self._most, self.name) from None
+            raise _outside(value, self._least, self._most, self.name) from None
         return self._moved(data)
 
     def pack_many(self, values: Sequence[Any]) -> bytes:
         """The bytes of a whole array. Raises `DoesNotFit`."""
-        if self.plain.issuperset(map(type, values)):
+        if self._are_plain(values):
             try:
                 data = self._many.pack(*values)
             except (struct.error, OverflowError):
                 return super().pack_many(values)
             return self._moved(data)
         return super().pack_many(values)
+
+    def _are_plain(self, values: Sequence[Any]) -> bool:
+        return self.plain.issuperset(map(type, values))
 
     @abstractmethod
     def _number(self, value: Any) -> Any:
@@ -157,11 +162,18 @@ class Float(Number):
             return Kind.pack_many(self, values)  # It names the value that would be 0.
         return data
 
+    def _are_plain(self, values: Sequence[Any]) -> bool:
+        types = {*map(type, values)}
+        return types <= self.plain or (
+            types <= {float, int}
+            and all(abs(each) <= MAX_EXACT for each in values if type(each) is int)
+        )
+
     def _number(self, value: Any) -> float:
         if isinstance(value, bool) or not isinstance(value, Real):
             raise DoesNotFit(f"{shown(value)} is not a number, which {self.name} requires")
         integer = as_integer(value)  # Those of NumPy are rounded to compare them with floats.
-        number = _float_for(value if integer is None else integer, self.name)
+        number = float_for(value if integer is None else integer, self.name)
         # A float of numpy with more bits, which `float` does not refuse.
         if isinf(number) and value != number:
             raise OverflowError
@@ -190,7 +202,17 @@ class Bcd(Bytewise):
 
 
 def _outside(value: Any, least: float, most: float, name: str) -> DoesNotFit:
-    return DoesNotFit(f"{shown(value)} is outside {least} to {most} of {name}")
+    return DoesNotFit(f"{_given(value)} is outside {least} to {most} of {name}")
+
+
+def _given(value: Any) -> str:
+    """A number of any library for a message: never a rounded one."""
+    if (integer := as_integer(value)) is not None:
+        return shown(integer)
+    with contextlib.suppress(OverflowError):
+        if isinstance(value, Real) and (number := float(value)) == value:
+            return shown(number)
+    return shown(value)
 
 
 def _required_integer(value: Any, name: str) -> int:
