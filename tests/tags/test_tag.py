@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from holdfast.simulation.capacity import nearest
 from holdfast.tags import Tag, TagError, TagList
 from holdfast.values import DoesNotFit, decode, encode
 
@@ -206,6 +207,13 @@ def test_the_limits_themselves_may_be_written() -> None:
     it = tag(min=5, max=30)
     assert (it.raw(5), it.raw(30)) == (5, 30)
     assert tag(min=5, max=5).raw(5) == 5
+
+
+def test_a_number_with_a_scale_is_rounded_to_a_float_once() -> None:
+    it = tag(type="float32", scale=2)
+    value, held = 2 * (2**60 + 2**36 + 1), 2.0**60 + 2.0**37
+    assert decode(encode(it.raw(value), "float32"), "float32") == held
+    assert nearest(it, value) == held
 
 
 def test_a_state_is_never_rounded() -> None:

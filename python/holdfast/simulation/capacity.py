@@ -41,7 +41,7 @@ def nearest(tag: Tag, value: Any) -> Any:
     if tag.is_float:
         # A fraction has no sign of zero.
         exact = value if linear.is_identity else linear.number(value)
-        return nearest_float(min(most, max(least, float(exact))), base)
+        return nearest_float(min(most, max(least, exact)), base)
     number = linear.number(value)
     raw = int(min(most, max(least, round(number))))
     near = itertools.chain(range(raw, int(least) - 1, -1), range(raw, int(most) + 1))
@@ -109,7 +109,7 @@ class Capacity:
         least, most = _limits(tag)
         if tag.is_float:
             with contextlib.suppress(OverflowError):  # It is outside then.
-                raw = nearest_float(float(raw), tag.of_type.base)
+                raw = nearest_float(raw, tag.of_type.base)
         if not least <= raw <= most:
             held = tag.value(nearest(tag, value))
             raise DoesNotFit(

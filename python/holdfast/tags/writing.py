@@ -10,7 +10,7 @@ from holdfast.tags.scale import RegisterScale, ScaledTag, is_finite
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
 from holdfast.values.errors import shown
-from holdfast.values.numeric import nearest_float
+from holdfast.values.numeric import float_for, nearest_float
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -122,7 +122,7 @@ class WritableTag(ScaledTag):
         if self._linear.is_identity:
             return value
         try:
-            return float(self._linear.number(value))
+            return float_for(self._linear.number(value), self.of_type.base)
         except OverflowError:
             raise DoesNotFit(f"{value} does not fit {self.type}") from None
 
