@@ -6,6 +6,7 @@ import asyncio
 import json
 import signal
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -144,8 +145,8 @@ def test_what_can_not_be_restored_is_told_and_changes_nothing(tmp_path: Path) ->
         done("log", "backup", str(file), str(backup))
         assert "backup: File exists" in failed("backup", file, backup)
         told = failed("restore", file, backup)
-        assert "the servers already have KV_holdfast-log-site, OBJ_holdfast-log-site, " in told
-        assert "if a restore was cut short, delete these streams" in told
+        assert "already have the log: KV_holdfast-log-site, OBJ_holdfast-log-site, " in told
+        assert "delete" not in told  # Nodes use it.
         write(appliance, 1, 8)
     other = configuration(tmp_path, "other", "line")
     assert "a backup of the log site, not of line" in failed("restore", other, backup)
@@ -180,11 +181,21 @@ def test_a_part_that_a_server_refuses_leaves_nothing_behind(tmp_path: Path) -> N
 def streams(server: NatsServer) -> list[str]:
     async def found() -> list[str]:
         client = await nats.connect(server.url)
-        names = [each.config.name or "" for each in await client.jetstream().streams_info()]
+        answer = await client.request("$JS.API.STREAM.NAMES", b"")
         await client.close()
-        return names
+        return json.loads(answer.data)["streams"] or []
 
     return asyncio.run(found())
+
+
+def delete(server: NatsServer, *names: str) -> None:
+    async def deleted() -> None:
+        client = await nats.connect(server.url)
+        for name in names:
+            await client.jetstream().delete_stream(name)
+        await client.close()
+
+    asyncio.run(deleted())
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no SIGHUP")
@@ -198,7 +209,7 @@ def test_no_node_begins_with_a_restore_that_was_cut_short(
     (tmp_path / "server").mkdir()
     server = NatsServer(tmp_path / "server")
     file = configuration(tmp_path, servers=[server.url])
-    send, delete, left = log_backup._send, log_backup._delete, list[str]()
+    send, clean_up, left = log_backup._send, log_backup._clean_up, list[str]()
 
     async def send_most(client: Any, stream: str, *more: Any) -> None:
         if stream.startswith("KV_"):
@@ -206,9 +217,12 @@ def test_no_node_begins_with_a_restore_that_was_cut_short(
             await asyncio.sleep(0)  # Ctrl-C ends it here.
         await send(client, stream, *more)
 
-    async def note_and_delete(*arguments: Any) -> None:
+    async def note_and_clean_up(*arguments: Any) -> str | None:
         left.extend(await asyncio.to_thread(streams, server))
-        await delete(*arguments)
+        return await clean_up(*arguments)
+
+    async def fail_to_clean_up(*_: Any) -> None:
+        raise log_backup.BackupFailed("no connection")
 
     # The tests may run in the background of a shell, or under nohup.
     usual: dict[signal.Signals, Any] = {
@@ -220,7 +234,7 @@ def test_no_node_begins_with_a_restore_that_was_cut_short(
     try:
         with monkeypatch.context() as patched:
             patched.setattr(log_backup, "_send", send_most)
-            patched.setattr(log_backup, "_delete", note_and_delete)
+            patched.setattr(log_backup, "_clean_up", note_and_clean_up)
             for number in usual:  # noqa: B007 - `send_most` raises it.
                 left.clear()
                 result = invoke("log", "restore", str(file), str(backup))
@@ -229,11 +243,97 @@ def test_no_node_begins_with_a_restore_that_was_cut_short(
                 # which nodes refuse.
                 assert sorted(left) == ["OBJ_holdfast-log-site", "holdfast-log-site"]
                 assert not streams(server)
+            patched.setattr(log_backup, "_clean_up", fail_to_clean_up)
+            told = failed("restore", file, backup)
+            assert "interrupted. What was restored could not be deleted, but no node begins" in told
+        told = failed("restore", file, backup)
+        assert "but no key of a snapshot" in told
+        assert "if no node runs, delete these streams" in told
+        delete(server, *streams(server))
         done("log", "restore", str(file), str(backup))
         assert "KV_holdfast-log-site" in streams(server)
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        server.kill()
+
+
+@pytest.mark.parametrize("kind", ["server", "cluster"])
+def test_an_upload_that_was_cut_leaves_nothing_behind(
+    kind: str, tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, backup = configuration(tmp_path), tmp_path / "backup"
+    with Appliance(load(file)) as appliance:
+        write(appliance, 1, 7)
+    done("log", "backup", str(file), str(backup))
+    monkeypatch.setattr(log_backup, "CHUNK_BYTES", 64)
+    sent = log_backup._request
+
+    async def send_one(client: Any, subject: str, payload: bytes) -> Any:
+        reply = await sent(client, subject, payload)
+        if len(payload) == 64:
+            raise log_backup.BackupFailed("cut")
+        return reply
+
+    monkeypatch.setattr(log_backup, "_request", send_one)
+    if kind == "cluster":
+        servers = request.getfixturevalue("cluster")
+        file = configuration(tmp_path, servers=urls(servers), replicas=3)
+        assert failed("restore", file, backup) == "holdfast: logs.site: cut\n"
+        # Without the deletion it would keep the name, and make a stream after some seconds.
+        assert "holdfast-log-site" not in streams(servers[0])
+        return
+    (tmp_path / "server").mkdir()
+    server = NatsServer(tmp_path / "server")
+    try:
+
+        async def look(*_: Any) -> None:
+            assert not await asyncio.to_thread(streams, server)
+
+        monkeypatch.setattr(log_backup, "_clean_up", look)
+        file = configuration(tmp_path, servers=[server.url])
+        assert failed("restore", file, backup) == "holdfast: logs.site: cut\n"
+    finally:
+        server.kill()
+
+
+@pytest.mark.parametrize("begun", ["holdfast-log-site", "OBJ_holdfast-log-site"])
+def test_a_restore_deletes_nothing_that_a_node_uses(
+    begun: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A node begins while the steps are sent, or one that still runs goes on with the steps."""
+    (tmp_path / "server").mkdir()
+    server, backup = NatsServer(tmp_path / "server"), tmp_path / "backup"
+    file, send = configuration(tmp_path, servers=[server.url]), log_backup._send
+    runs = begun == "OBJ_holdfast-log-site"
+    try:
+        with ExitStack() as stack, ExitStack() as former:
+            node = former.enter_context(Appliance(load(file)))
+            write(node, 1, 7)
+            done("log", "backup", str(file), str(backup))
+            if not runs:
+                former.close()
+            delete(server, *streams(server))
+
+            async def send_late(client: Any, name: str, *more: Any) -> None:
+                nonlocal node
+                if name == begun:
+                    if not runs:
+                        node = Appliance(load(file))
+                        await asyncio.to_thread(stack.enter_context, node)
+                    await asyncio.to_thread(write, node, 2, 8)
+                await send(client, name, *more)
+
+            monkeypatch.setattr(log_backup, "_send", send_late)
+            told = failed("restore", file, backup)
+            assert (
+                f"{begun}: stream name already in use, cannot restore. A node seems to run" in told
+            )
+            assert "nothing was deleted. Stop all nodes." in told
+            assert {*log_backup.streams("site")} <= {*streams(server)}
+            write(node, 3, 9)
+            assert [register(node, each) for each in (2, 3)] == [8, 9]
+    finally:
         server.kill()
 
 

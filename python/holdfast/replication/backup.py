@@ -20,7 +20,7 @@ from holdfast.net import event_loop
 from holdfast.net.nats.connection import connected_once, nats_reason
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine, Iterable
+    from collections.abc import Callable, Coroutine
     from pathlib import Path
     from typing import TypeVar
 
@@ -127,19 +127,24 @@ def restore(servers: Servers, log: str, replicas: int, folder: Path) -> int:
     """Puts a backup on servers that don't have the log. Returns the number of messages.
 
     No node may run. Raises `BackupFailed`. What was restored by then is deleted again, if the
-    servers can still be reached. If it is not, no node begins with it: the key of the snapshot,
-    without which a log with messages is refused, is restored last, and deleted first.
+    servers can still be reached and no node seems to use it. If it is not, no node begins with it:
+    the key of the snapshot, without which a log with messages is refused, is restored last, and
+    deleted first.
     """
     found = _checked(folder, log)
-    begun: list[str] = []
+    _run(servers, lambda client: _refuse_existing(client, log))
+    begun: dict[str, bool] = {}
     try:
         return _run(servers, lambda client: _restore(client, log, replicas, folder, found, begun))
-    except BaseException:
-        if begun:
-            # Over a new connection: what ends a command may also end the tasks of the old one.
-            with contextlib.suppress(BackupFailed):  # What has failed before is the reason.
-                _run(servers, lambda client: _delete(client, reversed(begun)))
-        raise
+    except BaseException as error:
+        # Over a new connection: what ends a command may also end the tasks of the old one.
+        try:
+            left = _run(servers, lambda client: _clean_up(client, log, begun))
+        except BackupFailed as failure:
+            left = f"What was restored could not be deleted, but no node begins with it: {failure}"
+        if left is None:
+            raise
+        raise BackupFailed(f"{str(error) or 'interrupted'}. {left}") from error
 
 
 def set_replicas(servers: Servers, log: str, replicas: int) -> dict[str, tuple[int, int]]:
@@ -337,36 +342,66 @@ def _checked(folder: Path, log: str) -> dict[str, Any]:
     return contents
 
 
+async def _existing(client: SafeClient, log: str) -> list[str]:
+    """The streams of a log, and of its leases, that the servers have."""
+    every = (*streams(log), *leases(log))
+    return [name for name in every if await _config(client, name) is not None]
+
+
+async def _refuse_existing(client: SafeClient, log: str) -> None:
+    """Raises `BackupFailed` if the servers have the log, or a part of it."""
+    there = await _existing(client, log)
+    if not there:
+        return
+    keys, _, steps = streams(log)
+    key = b""
+    if keys in there:
+        _, key = await _last(client, keys, f"$KV.{steps}.{SNAPSHOT_KEY}")
+    if key:
+        reason = f"the servers already have the log: {', '.join(there)}"
+    else:
+        reason = (
+            f"the servers already have {', '.join(there)}, but no key of a snapshot, as after a "
+            "restore that was cut short: if no node runs, delete these streams, for example with "
+            "nats stream rm, and restore again"
+        )
+    raise BackupFailed(reason)
+
+
 async def _restore(
     client: SafeClient,
     log: str,
     replicas: int,
     folder: Path,
     contents: dict[str, Any],
-    begun: list[str],
+    begun: dict[str, bool],
 ) -> int:
-    """Adds to `begun` which streams are to be deleted if it fails, in order."""
-    every = (*streams(log), *leases(log))
-    there = [name for name in every if await _config(client, name) is not None]
-    if there:
-        raise BackupFailed(
-            f"the servers already have {', '.join(there)}: if a restore was cut short, delete "
-            "these streams, for example with nats stream rm, and restore again"
-        )
+    """Adds to `begun` which streams the servers restore, and whether they have confirmed it."""
     for name in reversed(streams(log)):
         config = contents[name]["config"] | {"num_replicas": replicas}
         request = {"config": config, "state": contents[name]["state"]}
         answer = await _ask(client, f"STREAM.RESTORE.{name}", request)
-        # Only now: a stream that the servers have refused to restore may belong to a node.
-        begun.append(name)
+        begun[name] = False
         await _send(client, name, answer["deliver_subject"], folder / name, contents[name])
+        begun[name] = True
     return int(contents[streams(log)[-1]]["state"]["messages"])
 
 
-async def _delete(client: SafeClient, names: Iterable[str]) -> None:
-    for name in names:
-        with contextlib.suppress(_NotFound):  # Its restore was not complete.
+async def _clean_up(client: SafeClient, log: str, begun: dict[str, bool]) -> str | None:
+    """Deletes what was restored. Returns why not, if a node may use it."""
+    # A node may have made a stream while it was restored, or gone on with those restored before.
+    others = [name for name in await _existing(client, log) if not begun.get(name)]
+    if others:
+        return (
+            f"A node seems to run, since the servers now have {', '.join(others)}; nothing was "
+            "deleted. Stop all nodes. If one has gone on with the log, start them again; otherwise "
+            "delete the streams of the log, for example with nats stream rm, and restore again"
+        )
+    for name in reversed(begun):
+        # A cluster keeps the name of a stream whose restore was cut short, and makes it later.
+        with contextlib.suppress(_NotFound):
             await _ask(client, f"STREAM.DELETE.{name}")
+    return None
 
 
 async def _send(
