@@ -236,13 +236,21 @@ def test_a_node_that_may_not_write_the_bucket_says_so(tmp_path: Path) -> None:
     async def work() -> None:
         async with running(server.url, "a", LASTING) as node:
             node.leases.want(["x"])
-            await until(lambda: len(node.events) > 1, "it is refused")
+            await until(lambda: len(node.events) == 2, "it is refused")
+            node.leases.want([])
+            node.connected(node.client)
+            await until(lambda: len(node.events) == 3, "it may be allowed with a new connection")
+            node.leases.want(["x"])
+            await until(lambda: len(node.events) == 4, "it is refused again")
             # What others may write does not help it.
             async with running(allowed, "b", LASTING) as other:
                 other.leases.want(["y"])
                 await until(lambda: node.leases.holder("y") is not None, "it sees another lease")
-            assert node.events == ["works", f"fails: {reason}"]
-            assert node.leases.reason == reason
+                assert node.leases.reason == reason
+                # It need not write as long as others hold all that it wants.
+                other.leases.want(["x", "y"])
+                await until(lambda: node.leases.reason is None, "it stands by")
+            assert node.events == [*2 * ["works", f"fails: {reason}"], "works"]
 
     try:
         make_settled(allowed, BUCKET)

@@ -136,7 +136,7 @@ class Leases:
         """Why the bucket does not work; `None` if it does."""
         self._is_opening = self._is_checked = self._is_settling = False
         self._refusal: Exception | None = None
-        """Why the last write was refused, if none was accepted since."""
+        """Why the last write was refused, if it may still be so."""
         self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
         self._made_at: datetime | None = None
         self.may_settle_at = 0.0
@@ -147,6 +147,8 @@ class Leases:
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""
         self._client = client
+        if client is not None and isinstance(self._refusal, ServerError):
+            self._refusal = None  # Permissions may have changed.
         if client is not None and self._bucket is not None and self._bucket.client is not client:
             self._bucket = None
         self._is_checked = False  # The server may have forgotten who follows, or what is stored.
@@ -346,15 +348,20 @@ class Leases:
         if before is not None and entry.revision <= before.revision:
             return
         self.seen[key] = entry
-        # Only this node may lack a permission.
-        is_of_all = not isinstance(self._refusal, ServerError)
-        if is_of_all and (entry.holding is not None or key == SETTLED):
+        # Only this node may lack a permission. What it need not write is no reason.
+        is_over = not isinstance(self._refusal, ServerError) or self._stands_by()
+        if is_over and (entry.holding is not None or key == SETTLED):
             self._note_write()
         was, now = (None if each is None else each.holding for each in (before, entry))
         same = was is not None and now is not None and was.process == now.process
         if not same:
             self._news.set()
             self._watcher.changed()
+
+    def _stands_by(self) -> bool:
+        """Whether other nodes hold all leases that are wanted."""
+        holders = map(self.holder, self._wanted)
+        return all(each is not None and each.process != self.process for each in holders)
 
     def _take_free(self, now: float) -> None:
         if self._bucket is None or not self._is_checked or not self.is_read:
