@@ -86,7 +86,7 @@ def watch(
     turn pages. Without a terminal, on a dumb one (TERM=dumb), or with --json, prints a line for
     every change; with --csv, a line for every reading.
 
-    Exit codes: 0 ended by q, Ctrl-C or SIGTERM, 1 the first reading failed, 2 wrong usage.
+    Exit codes: 0 ended by q, Ctrl-C, SIGTERM or SIGHUP, 1 the first reading failed, 2 wrong usage.
     """
     click.get_current_context().with_resource(stops_as_ctrl_c())
     if is_url(target) or files.config is not None:
