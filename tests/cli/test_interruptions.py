@@ -139,11 +139,11 @@ def test_a_write_that_is_interrupted_was_possibly_carried_out(
 STOPS = """
 import signal
 from functools import partial
-from holdfast.cli.signals import stops
+from holdfast.cli.signals import on_ctrl_z
 say = partial(partial, print, flush=True)
 signal.signal(signal.SIGTSTP, signal.SIG_DFL)
 for _ in range(2):
-    with stops(say("keys left"), say("keys")), stops(say("screen left"), say("screen")):
+    with on_ctrl_z(say("keys left"), say("keys")), on_ctrl_z(say("screen left"), say("screen")):
         signal.raise_signal(signal.SIGTSTP)
 print(signal.getsignal(signal.SIGTSTP) == signal.SIG_DFL)
 """

@@ -18,8 +18,9 @@ _COMMAND = f"{__name__}.command"
 
 
 def note_wanted(context: click.Context, _: click.Parameter, as_json: bool) -> bool:
-    """Takes the value of `--json`. The context is kept: an interruption ends it, and is told after
-    that."""
+    """Takes the value of `--json`. The context is kept: an interruption ends it, and is reported
+    after that.
+    """
     if as_json:
         context.meta[_COMMAND] = context
     return as_json

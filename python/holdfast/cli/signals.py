@@ -157,7 +157,7 @@ def stops_as_ctrl_c() -> Iterator[None]:
 
 
 @contextmanager
-def stops(before: Callable[[], None], after: Callable[[], None]) -> Iterator[None]:
+def on_ctrl_z(before: Callable[[], None], after: Callable[[], None]) -> Iterator[None]:
     """Lets Ctrl-Z call `before` and then stop the process, and calls `after` when it continues.
 
     For modes of the terminal, which the shell needs as they were. Those inside come first.

@@ -9,7 +9,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, TypeAlias
 
-from holdfast.cli.signals import stops
+from holdfast.cli.signals import on_ctrl_z
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -40,7 +40,7 @@ def keys() -> Iterator[Wait]:
         def leave() -> None:
             termios.tcsetattr(terminal, termios.TCSADRAIN, before)
 
-        with stops(leave, take):
+        with on_ctrl_z(leave, take):
             try:
                 take()
                 yield lambda seconds: _posix(terminal, seconds)

@@ -17,7 +17,7 @@ from rich.text import Text
 
 from holdfast.cli import terminal_text
 from holdfast.cli.live import keys, schedule
-from holdfast.cli.signals import stops
+from holdfast.cli.signals import on_ctrl_z
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -84,7 +84,7 @@ class Screen(ABC):
             contextlib.suppress(Quit, KeyboardInterrupt),
             keys.keys() as wait,
             self._live,
-            stops(lambda: self._switch(False), lambda: self._switch(True)),
+            on_ctrl_z(lambda: self._switch(False), lambda: self._switch(True)),
         ):
             self._wait = wait
             for tick in schedule.ticks(self._every, times, self._pause):
