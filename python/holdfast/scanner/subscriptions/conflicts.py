@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.client.serial_settings import SerialTarget
 from holdfast.client.tolerance import STRICT
+from holdfast.client.url import shared_options
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.subject_parts import subject_id
 from holdfast.scanner.subscriptions.subscription import SETTINGS
@@ -22,9 +23,6 @@ if TYPE_CHECKING:
     from holdfast.client.url import Target
     from holdfast.scanner.subscriptions.device import ScannedDevice, Source
     from holdfast.scanner.subscriptions.subscription import Subscription
-
-LINE_SETTINGS = ("mode", "baud", "parity", "stop_bits", "data_bits", "silence")
-"""Settings that must be equal for all devices on one serial line."""
 
 
 def replaces(device: ScannedDevice, subscription: Subscription) -> bool:
@@ -90,12 +88,12 @@ def check_subject(id: str, owners: Mapping[str, str]) -> None:
 
 def check_settings(target: Target, other: ScannedDevice) -> None:
     """Raises `Refused` if a target has not the settings of a device on the same connection."""
-    settings, shared = _settings(target), other.source.target
+    settings, shared = shared_options(target), other.source.target
     names = [each.device for each in (target, shared) if isinstance(each, SerialTarget)]
     if len(set(names)) > 1:
         # The poller would open the line once for each name, and only the first can have it.
         raise Refused(f"{names[0]} is the serial line {names[1]} of {other.id}: use that name")
-    for key, known in _settings(shared).items():
+    for key, known in shared_options(shared).items():
         if known != settings[key]:
             at = "on one serial line" if isinstance(target, SerialTarget) else "at one address"
             raise Refused(
@@ -117,24 +115,18 @@ def connection_of(target: Target) -> str:
     return os.path.realpath(target.device) if isinstance(target, SerialTarget) else str(target)
 
 
-def _settings(target: Target) -> dict[str, object]:
-    """Returns the settings that must be equal for all devices of one connection."""
-    line = LINE_SETTINGS if isinstance(target, SerialTarget) else ()
-    return {key: getattr(target, key) for key in line} | asdict(target.tolerance)
-
-
 def _described(source: Source) -> str:
     """Formats the address of a device with everything that identifies it."""
     target = source.target
     usual: dict[str, object] = asdict(STRICT)
     more = ""
     if isinstance(target, SerialTarget):
-        usual["mode"] = target.mode
+        usual |= {"mode": target.mode, "rs485": None}
     elif target.tls.name is not None:
         more = f" with the name {target.tls.name}"
     settings = [
         f"{key} {_setting_text(value)}"
-        for key, value in _settings(target).items()
+        for key, value in shared_options(target).items()
         if key not in usual or value != usual[key]
     ]
     more += f" ({', '.join(settings)})" if settings else ""
