@@ -61,6 +61,16 @@ class ServerError(Error):
     It is that of a missing permission, with subjects as they are spelled.
     """
 
+    @property
+    def subject(self) -> str:
+        """The subject that it names, as `as_quoted` has it; the server says it only in the text."""
+        return str(self).partition('"')[2].rpartition('"')[0]
+
+
+def as_quoted(subject: str) -> str:
+    """A subject as in an error of the server, which quotes it."""
+    return json.dumps(subject, ensure_ascii=False)[1:-1]
+
 
 class _Head(NamedTuple):
     """The line before the bytes of a message."""

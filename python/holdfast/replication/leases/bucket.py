@@ -26,7 +26,7 @@ from nats.js.api import (
 )
 from nats.js.errors import APIError, NoStreamResponseError, NotFoundError
 
-from holdfast.net.nats.tolerant_client import ServerError
+from holdfast.net.nats.tolerant_client import ServerError, as_quoted
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.runtime.malformed_json import MALFORMED_JSON
 
@@ -234,9 +234,9 @@ class KeyBucket:
             async with asyncio.timeout(self._key_timeout_s):
                 return await answered
         except TimeoutError:
-            error = self.client.last_error
-            names_it = f'"{subject}"' in str(error)
-            if isinstance(error, ServerError) and error is not before and names_it:
+            error, quoted = self.client.last_error, as_quoted(subject)
+            is_new = error is not before
+            if is_new and isinstance(error, ServerError) and error.subject == quoted:
                 raise error from None
             raise NoAnswer from None
         finally:

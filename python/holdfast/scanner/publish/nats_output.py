@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -15,7 +14,7 @@ from nats.errors import Error
 
 from holdfast.net.event_loop import EventLoop
 from holdfast.net.nats.connection import MAX_PENDING_BYTES, nats_reason
-from holdfast.net.nats.tolerant_client import SafeClient
+from holdfast.net.nats.tolerant_client import SafeClient, ServerError, as_quoted
 from holdfast.outputs.sending import Receiver, Refused, soon_after
 from holdfast.polling.faults import fault_text, is_exception
 from holdfast.scanner.dialects import DIALECTS
@@ -54,8 +53,8 @@ class NatsOutput(Receiver):
         self._lost: asyncio.Event | None = None
         """Set when the connection of the client has ended."""
         self._states: dict[str, str] = {}
-        self._forbidden: list[str] = []
-        """The reason of each message that the server forbade, since the last step began."""
+        self._forbidden: list[Exception] = []
+        """The error of each message that the server forbade, since the last step began."""
 
     def until(self, stop: Stop) -> None:
         """Ends a wait for the server soon after the stop. Called before all else."""
@@ -114,10 +113,10 @@ class NatsOutput(Receiver):
                     await client.publish(subject, payload)
         # The server tells of each message that it forbids before it confirms the step.
         await self._confirmed(client)
-        reasons += self._forbidden
-        forbidden = {reason.partition('"')[2].rpartition('"')[0] for reason in self._forbidden}
+        reasons += map(nats_reason, self._forbidden)
+        forbidden = {each.subject for each in self._forbidden if isinstance(each, ServerError)}
         for subject, which in published.items():
-            if _as_reported(subject) in forbidden:
+            if as_quoted(subject) in forbidden:
                 refused.update((subject, at) for at in which)
         for subject, at in refused:
             if subject.startswith(f"{self._prefix}.status."):
@@ -177,7 +176,7 @@ class NatsOutput(Receiver):
 
     async def _note_error(self, error: Exception) -> None:
         """Notes a message that the server forbids. Any other error also ends `send`."""
-        self._forbidden.append(nats_reason(error))
+        self._forbidden.append(error)
 
     def _close_client(self) -> None:
         client, self._client = self._client, None
@@ -211,8 +210,3 @@ class NatsOutput(Receiver):
             (f"{self._prefix}.status.{name}", payload)
             for name in self._dialect.device_names(device)
         ]
-
-
-def _as_reported(subject: str) -> str:
-    """A subject as in the error of the server, which quotes it."""
-    return json.dumps(subject, ensure_ascii=False)[1:-1]
