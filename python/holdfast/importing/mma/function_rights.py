@@ -1,4 +1,4 @@
-"""Converts lists of function codes to the keys of a rule."""
+"""Which functions a rule of the source allows, and the keys of a rule that allow the same here."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from holdfast.importing.key_reader import Section
+    from holdfast.importing.notes import Choices
 
 SOURCE = frozenset({1, 2, 3, 4, 5, 6, 15, 16})
 """Functions that the source supports; it refuses all others."""
@@ -31,6 +32,13 @@ WRITING_ONLY = SOURCE & WRITING
 
 OTHERS = frozenset(each.code for each in _SERVED if each.area is None)
 """Functions that access no area."""
+
+_ALLOW = {"ro": READING, "rw": ALL, "wo": WRITING_ONLY}
+_MEANT = {
+    "ro": "its peers may read",
+    "rw": "its peers may read and write",
+    "wo": "its peers may write",
+}
 
 _CLOSE = {22: {6, 16}, 23: {3, 6, 16}}
 """Functions with the effect of others: a peer that is denied those must not have these."""
@@ -52,6 +60,41 @@ def read_codes(section: Section, key: str) -> list[int] | None:
         else:
             codes[code] = None
     return list(codes)
+
+
+def allowed_by(rule: Section, choices: Choices) -> frozenset[int]:
+    """What `allow_fc` and `allow` of a rule of the second generation allow."""
+    codes = read_codes(rule, "allow_fc")
+    if rule.get("allow") is not None:
+        meant = _allow(rule, codes, choices)
+        return meant if choices.as_meant else frozenset(codes or ())
+    if codes is None:
+        rule.desk.check(rule.path, "neither allow_fc nor allow: the rule allows nothing")
+    return frozenset(codes or ())
+
+
+def _allow(rule: Section, codes: list[int] | None, choices: Choices) -> frozenset[int]:
+    """What `allow` was meant to allow. The source did not read it, in none of its versions."""
+    path = rule.at("allow")
+    if not choices.as_meant:
+        nothing = "the rule allowed no function, and refused its peers"
+        ran = f"it had no effect: {nothing if codes is None else 'allow_fc decided'}"
+        meant = _MEANT.get(str(rule.get("allow")), "an error: it is not ro, rw or wo")
+        choices.note(rule.desk, path, ran=ran, meant=meant)
+        return frozenset()
+    word = rule.word("allow", list(_ALLOW))
+    if codes is not None:
+        message = "found together with allow_fc, allowed: only one of them"
+        rule.problem_of_key("allow", message)
+    if word is None:
+        return frozenset()
+    ran = "it had no effect: the rule allowed no function, and refused its peers"
+    choices.note(rule.desk, path, ran=ran, meant=_MEANT[word])
+    if word == "wo":
+        message = f"only functions {spelled(_ALLOW[word])}, which write; 22 and 23"
+        text = f"{message} also read. A rule has no other way to forbid reading"
+        rule.changed("allow", text)
+    return _ALLOW[word]
 
 
 def touching(areas: Iterable[str]) -> frozenset[int]:

@@ -36,16 +36,6 @@ _MEMORY_REASONS = {
     "rbe": TOP_REASONS["rbe"],
     "persistence": TOP_REASONS["persistence"],
 }
-_ALLOW = {
-    "ro": functions.READING,
-    "rw": functions.ALL,
-    "wo": functions.WRITING_ONLY,
-}
-_MEANT = {
-    "ro": "its peers may read",
-    "rw": "its peers may read and write",
-    "wo": "its peers may write",
-}
 BUSY = 6
 
 
@@ -203,38 +193,6 @@ class SecondGeneration(Reader):
         networks = tuple(read_networks(rule, "source_ip", required=True))
         if rule.get("source_ip") == []:
             self.desk.left_out(rule.path, "source_ip is empty: the rule matches nobody")
-        allowed = self._allowed(rule)
+        allowed = functions.allowed_by(rule, self.choices)
         rule.close()
         return networks, allowed
-
-    def _allowed(self, rule: Section) -> frozenset[int]:
-        codes = functions.read_codes(rule, "allow_fc")
-        if rule.get("allow") is not None:
-            meant = self._allow(rule, codes)
-            return meant if self.choices.as_meant else frozenset(codes or ())
-        if codes is None:
-            self.desk.check(rule.path, "neither allow_fc nor allow: the rule allows nothing")
-        return frozenset(codes or ())
-
-    def _allow(self, rule: Section, codes: list[int] | None) -> frozenset[int]:
-        """What `allow` was meant to allow. The source did not read it, in none of its versions."""
-        path = rule.at("allow")
-        if not self.choices.as_meant:
-            nothing = "the rule allowed no function, and refused its peers"
-            ran = f"it had no effect: {nothing if codes is None else 'allow_fc decided'}"
-            meant = _MEANT.get(str(rule.get("allow")), "an error: it is not ro, rw or wo")
-            self.choices.note(self.desk, path, ran=ran, meant=meant)
-            return frozenset()
-        word = rule.word("allow", list(_ALLOW))
-        if codes is not None:
-            message = "found together with allow_fc, allowed: only one of them"
-            self.desk.problem_of_key(path, message)
-        if word is None:
-            return frozenset()
-        ran = "it had no effect: the rule allowed no function, and refused its peers"
-        self.choices.note(self.desk, path, ran=ran, meant=_MEANT[word])
-        if word == "wo":
-            message = f"only functions {functions.spelled(_ALLOW[word])}, which write; 22 and 23"
-            text = f"{message} also read. A rule has no other way to forbid reading"
-            self.desk.changed(path, text)
-        return _ALLOW[word]
