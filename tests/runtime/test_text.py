@@ -15,7 +15,6 @@ from holdfast.runtime.text import (
     listing,
     os_error_text,
     quote,
-    suggestion,
 )
 
 
@@ -37,11 +36,6 @@ def test_lists_are_as_in_a_sentence() -> None:
     assert listing([1, 2, 3]) == "1, 2, 3"
 
 
-def test_a_close_word_is_suggested() -> None:
-    assert suggestion("coil", ["holding_registers", "coils"]) == "; did you mean 'coils'?"
-    assert suggestion("x", ["holding_registers"]) == ""
-
-
 def test_an_error_of_windows_has_the_text_of_its_own_number(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -53,14 +47,3 @@ def test_an_error_of_windows_has_the_text_of_its_own_number(
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.setattr(ctypes, "FormatError", texts.get, raising=False)
     assert os_error_text(refused) == texts[1225]
-
-
-def test_nothing_is_suggested_for_a_long_word() -> None:
-    assert suggestion("m" * 256 + "emory", ["m" * 256 + "emory"]) == ""
-
-
-def test_a_word_in_another_case_is_suggested_before_words_that_are_close() -> None:
-    types = ["modbus-udp", "modbus-tcp", "read_only"]
-    assert suggestion("Modbus-TCP", types) == "; did you mean 'modbus-tcp'?"
-    assert suggestion("Read-Only", types) == "; did you mean 'read_only'?"
-    assert suggestion("plant_b", ["plant_a", "Plant_B"]) == "; did you mean 'Plant_B'?"

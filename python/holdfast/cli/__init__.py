@@ -20,6 +20,7 @@ from holdfast.cli.old_spellings import OLD_NAMES, hint, renewed
 from holdfast.cli.signals import keep_hangups
 from holdfast.runtime import extras
 from holdfast.runtime.interpreter import spare_memory
+from holdfast.runtime.suggestion import alike
 from holdfast.runtime.text import either, sentence
 
 if TYPE_CHECKING:
@@ -109,9 +110,7 @@ def _suggestion(name: str, known: Mapping[str, str]) -> str:
     """What was probably meant, as the end of a message: `known` has what to type for each name."""
     if "://" in name:
         return f" Did you mean 'holdfast read {name}'?"
-    import difflib
-
-    close = difflib.get_close_matches(name.lower(), known, n=3, cutoff=0.6)
+    close = alike(name.lower(), known, most=3)
     return f" Did you mean {either(repr(known[each]) for each in close)}?" if close else ""
 
 

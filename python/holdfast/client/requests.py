@@ -23,7 +23,8 @@ from holdfast.protocol import (
     READ_RECORDS,
     WRITE_LIMITS,
 )
-from holdfast.runtime.text import listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import listing
 from holdfast.types import AREAS, BIT_AREAS, SHORT_AREAS, WRITABLE_AREAS
 from holdfast.values.codec import codec_for
 from holdfast.values.errors import UnknownType

@@ -15,7 +15,8 @@ from holdfast.net.hosts import host_and_port
 from holdfast.net.tls import NO_FILES
 from holdfast.net.tls import Tls as Tls
 from holdfast.protocol import MAX_UNIT, usual_port
-from holdfast.runtime.text import listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import listing
 from holdfast.types import SERIAL_FRAMES, TRANSPORTS
 
 if TYPE_CHECKING:

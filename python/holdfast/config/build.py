@@ -17,7 +17,9 @@ from holdfast.config.models.outputs import OUTPUT_TYPES
 from holdfast.config.models.partial import partial
 from holdfast.config.models.root import Config
 from holdfast.config.text.messages import shape, show
-from holdfast.runtime.text import either, listing, seconds_in, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import either, listing
+from holdfast.runtime.time_units import seconds_in
 
 if TYPE_CHECKING:
     from pathlib import Path

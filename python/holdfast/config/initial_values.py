@@ -16,7 +16,8 @@ from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.protocol import ADDRESSES, MAX_WORD
-from holdfast.runtime.text import extent, listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import extent, listing
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:

@@ -37,6 +37,7 @@ from holdfast.config.text.problems import ConfigError, ConfigNotAnswered, Proble
 from holdfast.config.text.report import Report
 from holdfast.config.text.templates import expand_templates
 from holdfast.runtime import bounded_files
+from holdfast.runtime.suggestion import HIGH_LIKENESS, alike
 
 
 def load(path: Path | str) -> Config:
@@ -125,11 +126,8 @@ def _foreign(data: object) -> str | None:
         return shape(data) if data else show(data)
     if not data or any(str(key) in Config.model_fields for key in data):
         return None
-    # Imported here: only a file without any known key needs it.
-    from difflib import get_close_matches
-
     known = known_keys((), None)
-    if any(get_close_matches(str(key).lower(), known, cutoff=0.8) for key in data):
+    if any(alike(str(key).lower(), known, HIGH_LIKENESS) for key in data):
         return None
     unknown = "one unknown key" if len(data) == 1 else f"{len(data)} unknown keys"
     return f"a mapping with {unknown}"

@@ -11,7 +11,8 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.text.messages import show
-from holdfast.runtime.text import either, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import either
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 from typing import TYPE_CHECKING
 
@@ -12,14 +11,6 @@ if TYPE_CHECKING:
 
 MAX_CHARACTERS = 40
 """A longer value is cut."""
-
-MAX_COMPARED = 256
-"""Nothing is suggested for longer words: to compare one of a megabyte takes seconds."""
-
-TIME = re.compile(r"([0-9]+\.?[0-9]*|\.[0-9]+)(?:e([+-]?[0-9]{1,3}))? ?([a-z]*)", re.I)
-"""A time as people write it: a number, its exponent, and its unit."""
-
-_UNITS_S = {"ms": 0.001, "s": 1.0, "min": 60.0, "h": 3600.0, "": 1.0}
 
 _FIRST_OF_WINSOCK = 10_000
 """Errors of sockets on Windows, which `os.strerror` does not know, have no lower number."""
@@ -71,15 +62,6 @@ def file_error_text(error: OSError) -> str:
     return text if error.filename is None else f"{error.filename}: {text}"
 
 
-def seconds_in(text: str) -> float | None:
-    """The seconds of a time as in `500ms`, `2s` or `2`; `None` for other text, also for `m`."""
-    match = TIME.fullmatch(text)
-    unit = None if match is None else _UNITS_S.get(match[3].lower())
-    if match is None or unit is None:
-        return None
-    return float(f"{match[1]}e{match[2] or 0}") * unit
-
-
 def error_text(number: int) -> str:
     """The system's text for an error number."""
     if sys.platform == "win32" and number >= _FIRST_OF_WINSOCK:
@@ -101,21 +83,3 @@ def os_error_text(error: OSError) -> str:
 def _listed(values: Iterable[object], word: str) -> str:
     *most, last = dict.fromkeys(str(value) for value in values)
     return f"{', '.join(most)} {word} {last}" if most else last
-
-
-def suggestion(word: object, known: Iterable[object]) -> str:
-    """`; did you mean 'x'?` if a known word is close, in any case, else ""."""
-    import difflib
-
-    words, text = list(map(str, known)), str(word)
-    if len(text) > MAX_COMPARED:
-        return ""
-    same = [each for each in words if _plain(each) == _plain(text)]
-    close = same or difflib.get_close_matches(text, words, 1)
-    close = close or difflib.get_close_matches(text.lower(), words, 1)
-    return f"; did you mean {close[0]!r}?" if close else ""
-
-
-def _plain(word: str) -> str:
-    """A word without what people write in several ways."""
-    return word.casefold().replace("_", "-")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from holdfast.protocol import ADDRESSES
-from holdfast.runtime.text import MAX_COMPARED
+from holdfast.runtime.suggestion import HIGH_LIKENESS, MAX_COMPARED, alike
 from holdfast.values.errors import UnknownType, shown
 
 FIXED = {
@@ -132,9 +132,6 @@ USUAL_NAMES = {
 }
 """What other programs call these types, to suggest ours; "" for types that are not here."""
 
-CLOSE = 0.8
-"""How close a word must be to a type: `flag` and `float32` are not."""
-
 _SIZED = re.compile(r"(bit|bytes|char|str|string|text)([:.\[]?)([0-9]{1,6})[.\]]?")
 
 
@@ -168,12 +165,9 @@ def _meant(word: str) -> str:
     if word not in known:
         # Sign and size must not be guessed: others copy what is suggested.
         traits = _traits(word)
-        alike = [each for each in known if _traits(each) == traits]
+        same_traits = [each for each in known if _traits(each) == traits]
         swapped = [each for each in known if sorted(each) == sorted(word)]
-        # Imported here, for a fast start: only wrong names need it.
-        import difflib
-
-        word = next(iter(swapped or difflib.get_close_matches(word, alike, 1, CLOSE)), "")
+        word = next(iter(swapped or alike(word, same_traits, HIGH_LIKENESS)), "")
     return USUAL_NAMES.get(word, word)
 
 

@@ -30,7 +30,7 @@ from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.tags.files import tags_of
 from holdfast.events.writer import announce
 from holdfast.net.addresses import LOOPBACK, joined, reachable
-from holdfast.runtime.text import suggestion
+from holdfast.runtime.suggestion import suggestion
 from holdfast.server import Server
 from holdfast.simulation import HEATER, generators, playback
 from holdfast.simulation.device import Refused, SimulatedDevice

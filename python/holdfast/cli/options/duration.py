@@ -8,7 +8,7 @@ import click
 
 from holdfast.cli.options.option import Command, option
 from holdfast.client.base import MAX_TIMEOUT_S
-from holdfast.runtime.text import TIME, seconds_in
+from holdfast.runtime.time_units import TIME, seconds_in
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -22,7 +22,8 @@ from holdfast.cli.options.plc_addresses import (
     suggested_bit,
 )
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
-from holdfast.runtime.text import listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import listing
 from holdfast.types import AREAS, SHORT_AREAS, SHORT_OF
 
 if TYPE_CHECKING:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from holdfast.cli import answers
-from holdfast.runtime.text import clip, listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import clip, listing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable

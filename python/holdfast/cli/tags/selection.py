@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from holdfast.cli.options import item
-from holdfast.runtime.text import suggestion
+from holdfast.runtime.suggestion import suggestion
 from holdfast.tags import Tag, TagError, TagList
 from holdfast.types import BIT_AREAS, SHORT_OF
 from holdfast.values.types import parsed

@@ -15,7 +15,8 @@ from holdfast.cli.tags.read import value_shown
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.tag_writing import prepared
 from holdfast.errors import ModbusError
-from holdfast.runtime.text import listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import listing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

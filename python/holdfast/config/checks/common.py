@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from holdfast.config.models.base import INVALID, InvalidValue
 from holdfast.config.text.messages import show
 from holdfast.runtime import bounded_files
-from holdfast.runtime.text import listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import listing
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

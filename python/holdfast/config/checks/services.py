@@ -18,7 +18,8 @@ from holdfast.config.models.base import INVALID, InvalidValue
 from holdfast.config.models.listeners import ModbusTcpListener, UnitMemoryConfig
 from holdfast.config.models.services import HTTP_SERVICES
 from holdfast.config.text.messages import show
-from holdfast.runtime.text import either, extent, listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import either, extent, listing
 from holdfast.tags import Tag, TagError
 from holdfast.tags.scale import RegisterScale
 from holdfast.values.orders import DEFAULT_ORDER

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.config.checks.common import Scope, check_name, items, until_invalid
-from holdfast.runtime.text import extent, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import extent
 from holdfast.tags import Tag, TagError
 from holdfast.tags.scale import RegisterScale
 from holdfast.values.orders import DEFAULT_ORDER

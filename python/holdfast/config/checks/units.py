@@ -29,7 +29,8 @@ from holdfast.protocol import (
     READ_FIFO_QUEUE,
     WRITING_CODES,
 )
-from holdfast.runtime.text import either, extent, listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import either, extent, listing
 from holdfast.types import AREAS, WRITABLE_AREAS
 
 if TYPE_CHECKING:

@@ -39,7 +39,7 @@ from holdfast.config.values.scalars import (
     seconds,
 )
 from holdfast.protocol import LAST_ADDRESS
-from holdfast.runtime.text import suggestion
+from holdfast.runtime.suggestion import suggestion
 from holdfast.server.options import DEFAULTS
 from holdfast.types import Access, BitArea
 

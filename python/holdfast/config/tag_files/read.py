@@ -17,7 +17,8 @@ from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.config.text.report import Report
 from holdfast.config.values.scalars import is_name
 from holdfast.config.values.tag_scale import FORMS, PLACE_KEYS
-from holdfast.runtime.text import listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import listing
 from holdfast.tags import TagList
 from holdfast.tags.text import decimal_comma
 from holdfast.types import AREAS, SHORT_AREAS

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, get_args
 from holdfast.config.text.messages import show
 from holdfast.config.values.scalars import is_name
 from holdfast.protocol import LAST_ADDRESS
-from holdfast.runtime.text import either, listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import either, listing
 from holdfast.tags import Tag, TagError
 from holdfast.tags.scale import Form, RegisterScale
 from holdfast.types import AREAS, Area

@@ -12,7 +12,8 @@ from holdfast.config.tag_files.write import scale_as_data
 from holdfast.net.http.fields import Field, malformed
 from holdfast.net.http.requests import shown
 from holdfast.runtime.own_thread import OwnThread
-from holdfast.runtime.text import listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import listing
 from holdfast.tags.scale import RegisterScale
 from holdfast.tags.text import plain, text_of, value_from
 from holdfast.types import BIT_AREAS

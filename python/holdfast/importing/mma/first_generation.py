@@ -14,7 +14,8 @@ from holdfast.importing.mma.draft import ADMISSION, Reader
 from holdfast.importing.mma.memories import check_gate, read_areas, read_id
 from holdfast.importing.names import unique_names
 from holdfast.protocol import LAST_ADDRESS, MAX_UNIT, WRITING_CODES
-from holdfast.runtime.text import listing, suggestion
+from holdfast.runtime.suggestion import suggestion
+from holdfast.runtime.text import listing
 
 if TYPE_CHECKING:
     from holdfast.config.text.yaml_document import KeyPath
