@@ -18,8 +18,8 @@ from holdfast.adapters.rest.operations import document as document_of
 from holdfast.events import log_lines
 from holdfast.events.audit import Audit
 from holdfast.events.throttle import Throttle
-from holdfast.net.http.host import ConnectionLimits, Host
 from holdfast.net.http.port import listen
+from holdfast.net.http.server import ConnectionLimits, WebServer
 from support import web, wire
 from support.audits import writes
 
@@ -514,12 +514,12 @@ def test_a_fault_is_answered_without_a_detail_and_logged(log: web.Records) -> No
 
     listener = listen("127.0.0.1", 0)
     loopback = [ip_network("127.0.0.0/8")]
-    host = Host(
+    server = WebServer(
         "x", fail, listener, sources=loopback, limits=ConnectionLimits(1), request_timeout=9
     )
     with (
         contextlib.closing(listener),
-        web.in_a_thread(host),
+        web.in_a_thread(server),
         contextlib.closing(web.Client(listener.getsockname())) as client,
     ):
         for _ in range(2):

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 import holdfast
 from holdfast.adapters import Stop
-from holdfast.net.http import host as http_host
+from holdfast.net.http import server as http_server
 from holdfast.net.http.port import listen
 from support import web, wire
 from support.cases import examples
@@ -327,7 +327,7 @@ def test_a_connection_may_be_idle_between_requests(hasty: web.Service, connect: 
 def test_a_connection_may_not_be_idle_for_ever(
     start: Start, connect: Connect, monkeypatch: pytest.MonkeyPatch, refused: bool
 ) -> None:
-    monkeypatch.setattr(http_host, "KEEP_ALIVE_S", 0.1)
+    monkeypatch.setattr(http_server, "KEEP_ALIVE_S", 0.1)
     service = start()
     sent = web.post(GOOD)
     connection = connect(service, sent.replace(b"/json", b"/x") if refused else sent)
@@ -653,7 +653,7 @@ def test_ipv6_alone(start: Start, connect: Connect) -> None:
     ],
 )
 def test_how_a_peer_is_shown(host: str, shown: str) -> None:
-    assert http_host.address_of(host, 502) == shown
+    assert http_server.address_of(host, 502) == shown
 
 
 def test_there_are_only_so_many_connections(start: Start, connect: Connect) -> None:

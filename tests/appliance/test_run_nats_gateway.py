@@ -503,5 +503,5 @@ def test_what_is_not_served_is_not_imported(
             timeout=wire.DEADLINE,
             check=True,
         )
-    heavy = {"nats", "paho", "holdfast.net.http.host", "holdfast.gateway", "holdfast.scanner"}
+    heavy = {"nats", "paho", "holdfast.net.http.server", "holdfast.gateway", "holdfast.scanner"}
     assert heavy & set(made.stdout.split()) == parts

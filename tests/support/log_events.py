@@ -41,7 +41,7 @@ BY_VARIABLE = {
         "tag_repeated",
         "writable_ignored",
     },
-    "net/http/host.py": {"refused_source", "refused_full"},
+    "net/http/server.py": {"refused_source", "refused_full"},
 }
 """The names that a file logs without a literal."""
 

@@ -20,8 +20,8 @@ from holdfast.appliance.diagnostics import Diagnostics
 from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.services.supervision import Supervisor
 from holdfast.config.models.services import RestConfig
-from holdfast.net.http.host import STOP_TIMEOUT_S
 from holdfast.net.http.port import listen
+from holdfast.net.http.server import STOP_TIMEOUT_S
 from support import wire
 
 if TYPE_CHECKING:
@@ -238,14 +238,14 @@ def supervised(supervisor: Supervisor, listener: ListeningSocket) -> Iterator[No
 
 
 class Runs(Protocol):
-    """An adapter or a host."""
+    """An adapter or a server."""
 
     def run(self, stop: Stop) -> None: ...
 
 
 @contextlib.contextmanager
 def in_a_thread(what: Runs, stop: Stop | None = None) -> Iterator[None]:
-    """Runs an adapter or a host. At the end its thread must have stopped without an error."""
+    """Runs an adapter or a server. At the end its thread must have stopped without an error."""
     stop = stop or Stop()
     with ThreadPoolExecutor(1) as threads:
         running = threads.submit(what.run, stop)

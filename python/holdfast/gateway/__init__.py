@@ -10,7 +10,7 @@ from holdfast.gateway.app import App, rejection
 from holdfast.gateway.operations import document, operations
 from holdfast.gateway.settings import GatewayLimits, Settings
 from holdfast.net.allow_list import AllowedNetwork
-from holdfast.net.http.host import ConnectionLimits, Host, address_of
+from holdfast.net.http.server import ConnectionLimits, WebServer, address_of
 
 if TYPE_CHECKING:
     from holdfast._core import ListeningSocket, Poller
@@ -57,7 +57,7 @@ class Gateway:
             is_https=https is not None,
         )
         self._app.describe(document(__version__, settings), self.url)
-        self._host = Host(
+        self._server = WebServer(
             "gateway",
             self._app,
             listener,
@@ -72,18 +72,18 @@ class Gateway:
             rejection=rejection,
             https=https,
         )
-        self.heartbeat = self._host.heartbeat
+        self.heartbeat = self._server.heartbeat
 
     def run(self, stop: Stop) -> None:
         """Serves in this thread until `stop` is set."""
         stop.then(self._app.end)
-        self._host.run(stop)
+        self._server.run(stop)
 
     def status(self) -> dict[str, object]:
         """Returns the address and the counts of connections and requests. Thread-safe."""
         return {
             "address": self.address,
-            "connections": self._host.counts(),
-            "tls_failures": self._host.tls_failures(),
+            "connections": self._server.counts(),
+            "tls_failures": self._server.tls_failures(),
             **self._app.counts(),
         }

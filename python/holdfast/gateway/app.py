@@ -30,7 +30,7 @@ from holdfast.net.allow_list import AllowList
 from holdfast.net.http import health as probes
 from holdfast.net.http.application import Application, json_response
 from holdfast.net.http.events import Stream
-from holdfast.net.http.origin import Origins, is_direct
+from holdfast.net.http.host_and_origin import Origins, is_direct
 from holdfast.net.http.requests import (
     BadRequest,
     BrokenBody,

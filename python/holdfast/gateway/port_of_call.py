@@ -15,8 +15,8 @@ from holdfast.events import log_lines
 from holdfast.gateway.endpoints.read import AREAS_READ, not_a_read_function
 from holdfast.net.addresses import LAST_PORT
 from holdfast.net.http.fields import NotJson, decoded, filled, object_with
+from holdfast.net.http.host_and_origin import is_from_page
 from holdfast.net.http.operations import Body
-from holdfast.net.http.origin import is_from_page
 from holdfast.net.http.requests import BadRequest, shown
 from holdfast.protocol import LAST_ADDRESS, MAX_WORD, READ_LIMITS, WRITE_REGISTERS
 

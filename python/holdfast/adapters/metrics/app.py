@@ -17,10 +17,10 @@ from prometheus_client.registry import Collector
 from holdfast.adapters.metrics.families import all_metrics, readiness, tag_metrics
 from holdfast.net.http import health as probes
 from holdfast.net.http.application import Application
-from holdfast.net.http.host import ConnectionLimits, Host
+from holdfast.net.http.host_and_origin import Origins
 from holdfast.net.http.operations import Operation
-from holdfast.net.http.origin import Origins
 from holdfast.net.http.requests import BadRequest, Response, rejection, response
+from holdfast.net.http.server import ConnectionLimits, WebServer
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -66,7 +66,7 @@ class Metrics:
         names = frozenset(settings.hosts)
         origins = Origins(names=names, allowed=allowed, is_https=https is not None)
         self._app = App(registry, health, origins)
-        self._host = Host(
+        self._server = WebServer(
             "metrics",
             self._app,
             listener,
@@ -75,18 +75,18 @@ class Metrics:
             request_timeout=REQUEST_TIMEOUT_S,
             https=https,
         )
-        self.heartbeat = self._host.heartbeat
+        self.heartbeat = self._server.heartbeat
 
     def run(self, stop: Stop) -> None:
         """Serves until `stop` is set."""
-        self._host.run(stop)
+        self._server.run(stop)
 
     def status(self) -> dict[str, object]:
         """Returns the address and the counts of connections."""
         return {
-            "address": self._host.address,
-            "connections": self._host.counts(),
-            "tls_failures": self._host.tls_failures(),
+            "address": self._server.address,
+            "connections": self._server.counts(),
+            "tls_failures": self._server.tls_failures(),
         }
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from holdfast import __version__
 from holdfast.adapters.rest.app import App
 from holdfast.adapters.rest.operations import OPERATIONS, document
-from holdfast.net.http.host import STOP_TIMEOUT_S, ConnectionLimits, Host
+from holdfast.net.http.server import STOP_TIMEOUT_S, ConnectionLimits, WebServer
 
 if TYPE_CHECKING:
     from holdfast.adapters.diagnostics import DiagnosticsSource
@@ -39,7 +39,7 @@ class Rest:
         self._app = App(
             OPERATIONS, settings, memory_access, diagnostics, sessions, is_https=is_https
         )
-        self._host = Host(
+        self._server = WebServer(
             "rest",
             self._app,
             listener,
@@ -55,20 +55,20 @@ class Rest:
         )
         self._app.describe(
             document(__version__, settings.max_body, secured=settings.tokens != "none"),
-            f"{'https' if is_https else 'http'}://{self._host.address}",
+            f"{'https' if is_https else 'http'}://{self._server.address}",
         )
-        self.heartbeat = self._host.heartbeat
+        self.heartbeat = self._server.heartbeat
 
     def run(self, stop: Stop) -> None:
         """Serves until `stop` is set."""
         stop.then(self._app.end)
-        self._host.run(stop)
+        self._server.run(stop)
 
     def status(self) -> dict[str, object]:
         """Returns the address, the counts of connections, and how many change streams are open."""
         return {
-            "address": self._host.address,
-            "connections": self._host.counts(),
+            "address": self._server.address,
+            "connections": self._server.counts(),
             "streams": self._app.open_streams,
-            "tls_failures": self._host.tls_failures(),
+            "tls_failures": self._server.tls_failures(),
         }

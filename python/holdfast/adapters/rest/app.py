@@ -21,7 +21,7 @@ from holdfast.ingest import Refused
 from holdfast.net.http import events
 from holdfast.net.http.application import Application, json_response
 from holdfast.net.http.fields import malformed
-from holdfast.net.http.origin import Origins
+from holdfast.net.http.host_and_origin import Origins
 from holdfast.net.http.requests import (
     COMMANDS,
     JSON,

@@ -20,8 +20,8 @@ from holdfast.runtime import tasks
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable
 
+    from holdfast.net.http.host_and_origin import Origins
     from holdfast.net.http.operations import Body, Given, Later
-    from holdfast.net.http.origin import Origins
     from holdfast.net.http.requests import Request, SecondStep
 
 JUDGED = "judged"

@@ -1,4 +1,4 @@
-"""A host of HTTP/1.1: calls a handler for each request that the core hands over.
+"""The HTTP/1.1 server of all services: calls a handler for each request that the core hands over.
 
 The core admits peers, limits and times connections, decrypts and parses, in a thread of its own. It
 hands requests over in batches: each batch wakes the event loop once.
@@ -56,8 +56,8 @@ EVICTION_GRACE_S = 1.0
 """Seconds that a peer has to send a request, or to take a response, before it can be evicted."""
 
 STOP_TIMEOUT_S = 3.0
-"""Seconds for pending requests to finish when the host stops, by default. Longer than applications
-need to end them, so that a loaded machine can still send the answers."""
+"""Seconds for pending requests to finish when the server stops, by default. Longer than
+applications need to end them, so that a loaded machine can still send the answers."""
 
 NOT_HTTP = "not an HTTP request"
 UNPARSED = {
@@ -83,7 +83,7 @@ class ConnectionLimits:
 
 
 @dataclass(eq=False)
-class Host:
+class WebServer:
     """Serves the requests on a listening socket: calls a handler for each, one at a time.
 
     A handler that waits for a body that does not arrive in time gets `BadRequest`. It then has a
@@ -119,7 +119,7 @@ class Host:
         self._server: HttpServer | None = None
         self._counts = dict.fromkeys(COUNTS, 0)
         self._tls_failures: dict[str, int] = {}
-        self._open: dict[int, _HostRequest] = {}
+        self._open: dict[int, _ServerRequest] = {}
         """The requests whose handlers are coroutines, by number."""
         self._tasks: set[asyncio.Task[None]] = set()
         self._turns = asyncio.Lock()
@@ -230,7 +230,7 @@ class Host:
         """Calls the handler. Returns its second step, if it has one."""
         if isinstance(item, ParsedWrites):
             return self._begin_parsed(item)
-        request = _HostRequest(self._turns, *item)
+        request = _ServerRequest(self._turns, *item)
         try:
             outcome = self.handler(request)
         except Exception as error:
@@ -244,7 +244,7 @@ class Host:
         tasks.begin(self._answer(request, outcome), self._tasks)
         return None
 
-    def _second_step(self, request: _HostRequest, step: SecondStep) -> None:
+    def _second_step(self, request: _ServerRequest, step: SecondStep) -> None:
         try:
             answer = step()
         except Exception as error:
@@ -275,7 +275,7 @@ class Host:
         except Exception:
             log_lines.problem("request_failed", listener=self.name, peer="-")
 
-    async def _answer(self, request: _HostRequest, outcome: Awaitable[Response | None]) -> None:
+    async def _answer(self, request: _ServerRequest, outcome: Awaitable[Response | None]) -> None:
         """Waits for the response of a handler, and sends it."""
         answer: Response | None = None
         try:
@@ -306,7 +306,7 @@ class Host:
         log_lines.problem("request_failed", listener=self.name, peer=request.peer)
         return rejection(500, "internal_error", "see the log", "failed")
 
-    def _respond(self, request: _HostRequest, answer: Response) -> None:
+    def _respond(self, request: _ServerRequest, answer: Response) -> None:
         exchange = request.exchange
         exchange.respond(answer.status, answer.headers, answer.body, answer.closes)
 
@@ -368,7 +368,7 @@ class _WakeSocket(asyncio.BufferedProtocol):
         self._take()
 
 
-class _HostRequest(Request):
+class _ServerRequest(Request):
     """A request from the core."""
 
     __slots__ = ("_is_gone", "_turns", "_waiter", "_when_gone", "exchange", "has_begun")

@@ -1,4 +1,4 @@
-"""The host of HTTP services: the event loop that calls its handlers."""
+"""The server of HTTP services: the event loop that calls its handlers."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ import pytest
 
 from holdfast._core import HttpServer
 from holdfast.events import log_lines
-from holdfast.net.http.host import (
-    LARGE_BODY_BYTES,
-    ConnectionLimits,
-    Host,
-)
 from holdfast.net.http.port import listen
 from holdfast.net.http.requests import Request, Response
+from holdfast.net.http.server import (
+    LARGE_BODY_BYTES,
+    ConnectionLimits,
+    WebServer,
+)
 from support import web, wire
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 def loop_of_a_handler() -> str:
-    """The package that has the event loop in which a host calls its handler."""
+    """The package that has the event loop in which a server calls its handler."""
 
     def answer(_: Request) -> Response:
         loop = type(asyncio.get_running_loop())
@@ -36,17 +36,17 @@ def loop_of_a_handler() -> str:
 
     sources, limits = [ip_network("127.0.0.0/8")], ConnectionLimits(1)
     with closing(listen("127.0.0.1", 0)) as listener:
-        host = Host("x", answer, listener, sources=sources, limits=limits, request_timeout=9)
-        with web.in_a_thread(host), closing(web.Client(listener.getsockname())) as client:
+        server = WebServer("x", answer, listener, sources=sources, limits=limits, request_timeout=9)
+        with web.in_a_thread(server), closing(web.Client(listener.getsockname())) as client:
             return client.get("/").body.decode()
 
 
-def test_a_host_runs_in_uvloop_where_it_is_installed() -> None:
+def test_the_server_runs_in_uvloop_where_it_is_installed() -> None:
     pytest.importorskip("uvloop", reason="there is none for Windows")
     assert loop_of_a_handler() == "uvloop"
 
 
-def test_a_host_runs_without_uvloop(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_server_runs_without_uvloop(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "uvloop", None)
     assert loop_of_a_handler() == "asyncio"
 
@@ -87,7 +87,7 @@ def test_the_log_says_why_a_connection_can_not_be_accepted(
     monkeypatch.setattr(log_lines, "refused", lambda _, **fields: faults.append(fields))
     sources, limits = [ip_network("127.0.0.0/8")], ConnectionLimits(1)
     with closing(listen("127.0.0.1", 0)) as listener, socket.socket() as client:
-        host = Host(
+        server = WebServer(
             "x",
             lambda _: Response(200),
             listener,
@@ -95,7 +95,7 @@ def test_the_log_says_why_a_connection_can_not_be_accepted(
             limits=limits,
             request_timeout=wire.DEADLINE,
         )
-        with web.in_a_thread(host):
+        with web.in_a_thread(server):
             with closing(web.Client(listener.getsockname())) as first:
                 assert first.get("/").status == 200
             resource.setrlimit(resource.RLIMIT_NOFILE, (4, hard))
@@ -150,10 +150,10 @@ def reader() -> Reader:
 
 @pytest.fixture
 def address(reader: Reader) -> Iterator[tuple[str, int]]:
-    """The address of a host with this handler."""
+    """The address of a server with this handler."""
     sources, limits = [ip_network("127.0.0.0/8")], ConnectionLimits(20)
     with closing(listen("127.0.0.1", 0)) as listener:
-        host = Host(
+        server = WebServer(
             "x",
             reader,
             listener,
@@ -162,7 +162,7 @@ def address(reader: Reader) -> Iterator[tuple[str, int]]:
             request_timeout=wire.DEADLINE,
             stop_timeout=0,
         )
-        with web.in_a_thread(host):
+        with web.in_a_thread(server):
             yield listener.getsockname()
 
 
