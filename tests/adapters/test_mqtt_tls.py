@@ -200,7 +200,7 @@ def test_it_ends_at_once_in_a_handshake_that_goes_nowhere(
             running.stop(1.0)
             assert running.status()["last_error"] is None
 
-        monkeypatch.setattr("holdfast.net.mqtt.connect.CONNECT_TIMEOUT_S", 0.1)
+        monkeypatch.setattr("holdfast.net.mqtt.dial.CONNECT_TIMEOUT_S", 0.1)
         assert "no answer" in error(rig.run(settings(url, tls={"ca_file": authority.ca})))
 
 

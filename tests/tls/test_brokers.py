@@ -12,7 +12,7 @@ from urllib.parse import urlparse
 import pytest
 from nats.errors import Error
 
-from holdfast.net.mqtt.connect import dial
+from holdfast.net.mqtt.dial import dial
 from holdfast.net.mqtt.selector import Waiter
 from holdfast.net.nats.connection import Servers
 from holdfast.net.nats.tolerant_client import SafeClient

@@ -15,7 +15,7 @@ from holdfast.adapters.mqtt.sessions import session_of
 from holdfast.adapters.mqtt.subscriptions import Subscriptions
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
-from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S
+from holdfast.net.mqtt.dial import CONNACK_TIMEOUT_S
 from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secure_channel import failure_text
 from holdfast.runtime.backoff import Backoff

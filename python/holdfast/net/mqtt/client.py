@@ -14,7 +14,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from holdfast.net.mqtt import MAX_TEXT
-from holdfast.net.mqtt.connect import dial
+from holdfast.net.mqtt.dial import dial
 from holdfast.net.mqtt.packets import head
 from holdfast.net.secret_file import read_bytes
 

@@ -13,7 +13,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
 from holdfast.events import log_lines
-from holdfast.net.mqtt.connect import CONNACK_TIMEOUT_S
+from holdfast.net.mqtt.dial import CONNACK_TIMEOUT_S
 from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secure_channel import failure_text
 from holdfast.outputs import sending
