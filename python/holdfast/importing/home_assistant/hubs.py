@@ -5,18 +5,22 @@ A hub becomes one device for each unit id that its entities name.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlencode
 
 from holdfast.client.url import parse
-from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
-from holdfast.config.text.problems import ConfigError, ConfigNotAnswered
 from holdfast.config.values.scalars import MAX_TIME, MIN_TIME
 from holdfast.importing.home_assistant.entities import PLATFORMS, Entities, Places
+from holdfast.importing.home_assistant.included_files import IncludedFiles
+from holdfast.importing.home_assistant.source_defaults import (
+    SCAN_INTERVAL_S,
+    SERIAL_WAIT_MS,
+    TIMEOUT_S,
+    UNIT,
+)
 from holdfast.importing.home_assistant.write_actions import note_write_actions
 from holdfast.importing.imported import Imported, Source
 from holdfast.importing.key_reader import Secret, Section, section
@@ -29,11 +33,6 @@ if TYPE_CHECKING:
 
     from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.notes import Desk
-
-TIMEOUT_S = 3
-SCAN_INTERVAL_S = 15
-SERIAL_WAIT_MS = 30
-"""Defaults of the source; the last is the pause between two requests on a serial line."""
 
 BROKER = "mqtt://homeassistant.local"
 
@@ -60,16 +59,6 @@ _ENTITY_REASONS = {
 _MAX_DEPTH = 3
 """How deep the section can be in a file: as in `homeassistant: packages: NAME: modbus`."""
 
-_MAX_INCLUDES = 300
-"""Maximum number of files that are read because others name them, each time counted."""
-
-_MAX_INCLUDED_BYTES = 4 << 20
-"""Maximum size of these files together, each time counted: comments and empty lines take time and
-memory, too.
-"""
-
-_INSIDE = "a file in the folder of the imported one, or below it"
-
 _PACKAGES = ("homeassistant", "packages")
 
 _FORMER = (
@@ -83,7 +72,7 @@ def read_home_assistant(path: Path | str) -> Imported:
 
     Raises `ConfigError` with every problem that prevents the import.
     """
-    source = Source(path, _Tags(Path(path).parent).resolve)
+    source = Source(path, IncludedFiles(Path(path).parent).resolve)
     desk = source.desk
     desk.quoted_numbers = desk.folds = True
     roots = list(_sections((), desk.document.data))
@@ -138,89 +127,6 @@ def _former(path: KeyPath, data: Any) -> Iterator[KeyPath]:
         for key, value in data.items() if isinstance(data, dict) else enumerate(data):
             if key != "modbus":
                 yield from _former((*path, key), value)
-
-
-class _Tags:
-    """Gives tags of the source a value: `!secret`, and `!include` of a file below its folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = _real(folder)
-        self._secrets: dict[Path, Desk | None] = {}
-        self._includes_left = _MAX_INCLUDES
-        self._bytes_left = _MAX_INCLUDED_BYTES
-
-    def resolve(self, kind: str, text: str, file: str) -> Any:
-        if kind == "!include":
-            return self._included(text, Path(file).parent)
-        if kind == "!secret":
-            return self._secret(text, _real(Path(file).parent))
-        allowed = "what it stands for"
-        if kind.startswith("!include_dir_"):
-            allowed = "!include of each file; a file with hubs can be imported by itself"
-        raise ValueError(f"found {kind} {text}, allowed: {allowed}")
-
-    def _included(self, text: str, folder: Path) -> yaml_document.Included:
-        path = folder / text
-        self._includes_left -= 1
-        if self._includes_left < 0:
-            raise ValueError(
-                f"found !include {text}, allowed: {_MAX_INCLUDES} of them in all files"
-            )
-        if not _real(path).is_relative_to(self._folder):
-            raise ValueError(f"found !include {text}, allowed: {_INSIDE}")
-        try:
-            content = yaml_document.read_bytes(path, str(path), named_pipe=False)
-            decoded = yaml_document.decoded(content, str(path))
-        except ConfigNotAnswered:
-            raise  # Each further file of a mount that is gone takes as long.
-        except ConfigError as error:
-            raise ValueError(f"found !include {text}, but {error}") from None
-        self._bytes_left -= len(content)
-        if self._bytes_left < 0:
-            allowed = f"{_MAX_INCLUDED_BYTES} bytes in all files that are included"
-            raise ValueError(f"found !include {text}, allowed: {allowed}")
-        return yaml_document.Included(str(path), decoded)
-
-    def _secret(self, name: str, folder: Path) -> Any:
-        """The value in the nearest file with secrets, from the folder up, as in the source."""
-        for each in (folder, *folder.parents):
-            if not each.is_relative_to(self._folder):
-                break
-            if each not in self._secrets:
-                self._secrets[each] = self._secrets_in(each / "secrets.yaml")
-            desk = self._secrets[each]
-            if desk is not None and desk.document.holds((name,)):
-                return _secret_of(desk, name)
-        missing = "which is not in secrets.yaml beside the imported file"
-        raise ValueError(f"found the secret {name}, {missing}, allowed: its value")
-
-    def _secrets_in(self, file: Path) -> Desk | None:
-        if not file.is_file():
-            return None
-        if not _real(file).is_relative_to(self._folder):
-            raise ValueError(f"found a secret, but {file} is a link, allowed: {_INSIDE}")
-        try:
-            return Source(file, lambda kind, text, _: yaml_document.scalar(text, kind)).desk
-        except ConfigNotAnswered:
-            raise
-        except ConfigError:
-            raise ValueError(f"found a secret, but {file} is not YAML that can be read") from None
-
-
-def _real(path: Path) -> Path:
-    """The path without links: only what is in the folder is read."""
-    return Path(os.path.realpath(path))
-
-
-def _secret_of(desk: Desk, name: str) -> Any:
-    """The value of a secret that a file has; messages never show it."""
-    found = desk.report.raw((name,))
-    if found is None or isinstance(found, dict | list):
-        raise ValueError(f"found the secret {name} without a value, allowed: text or a number")
-    if desk.document.spell((name,)) in {problem.key for problem in desk.report.problems}:
-        base = "which the source read as octal or binary"
-        raise ValueError(f"found the secret {name}, {base}, allowed: a number without a 0 in front")
-    return Secret(found) if isinstance(found, str) else found
 
 
 def _config(devices: dict[str, dict[str, Any]]) -> dict[str, Any]:
@@ -373,9 +279,9 @@ class _Hub:
         least, most = (1, MAX_SERIAL_UNIT) if self._is_line else (0, MAX_UNIT)
         number = entity.integer(key, least, most, what="a unit id")
         if entity.get(key) is None:
-            message = "no slave: unit 1, as in newer versions; older ones asked 0"
+            message = f"no slave: unit {UNIT}, as in newer versions; older ones asked 0"
             self.desk.check(entity.path, message)
-        unit = self.units.setdefault(1 if number is None else number, _Unit(Places(self.desk)))
+        unit = self.units.setdefault(UNIT if number is None else number, _Unit(Places(self.desk)))
         interval = entity.integer("scan_interval", 0, 86_400, what="seconds")
         known = len(unit.places.tags)
         if entity.text("name", required=True) is not None:
