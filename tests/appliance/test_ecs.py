@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.events import ecs, log_lines, security
+from holdfast.events import ecs, ecs_categories, log_lines
 from support import wire
 from support.cli import RunCommand
 
@@ -114,7 +114,7 @@ def test_other_events_are_in_another_dataset_and_have_no_category() -> None:
         "dataset": "holdfast.log",
         "action": "device_health",
     }
-    assert "device_health" not in security.EVENTS
+    assert "device_health" not in ecs_categories.EVENTS
 
 
 def test_an_exception_is_an_error_message() -> None:

@@ -10,8 +10,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from holdfast.config import json_schema
-from holdfast.events import ecs, log_lines
-from holdfast.events import security as security_events
+from holdfast.events import ecs, ecs_categories, log_lines
 from support.log_events import logged
 from support.paths import DOCS
 
@@ -45,26 +44,26 @@ def test_the_tables_have_every_security_event_and_what_it_is() -> None:
         event, *reason = names(first)
         key = (event, *reason)
         assert key not in told
-        told[key] = security_events.Meaning(
+        told[key] = ecs_categories.Meaning(
             tuple(category.split(", ")),
             tuple(kind.split(", ")),
             outcome,
         )
-    known = {(event,): meaning for event, meaning in security_events.EVENTS.items()}
-    assert told == known | dict(security_events.BY_REASON)
+    known = {(event,): meaning for event, meaning in ecs_categories.EVENTS.items()}
+    assert told == known | dict(ecs_categories.BY_REASON)
 
 
 def test_every_event_of_the_code_is_a_security_event_or_one_of_the_others() -> None:
-    security, others = set(security_events.EVENTS), set(names(OTHERS))
+    security, others = set(ecs_categories.EVENTS), set(names(OTHERS))
     assert len(others) > 20
     assert security & others == set()
     assert sorted(logged() - security - others) == []
     assert sorted((security | others) - logged()) == []
 
 
-@pytest.mark.parametrize("event", security_events.EVENTS)
+@pytest.mark.parametrize("event", ecs_categories.EVENTS)
 def test_category_and_type_are_those_of_ecs(event: str) -> None:
-    meaning = security_events.EVENTS[event]
+    meaning = ecs_categories.EVENTS[event]
     expected = {kind for category in meaning.category for kind in TYPES[category].split()}
     assert set(meaning.type) <= expected
 

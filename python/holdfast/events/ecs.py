@@ -1,6 +1,7 @@
 """Log lines as documents of the Elastic Common Schema (ECS), for a SIEM.
 
-The names are stable, see docs/security-events.md.
+The names are stable, see docs/security-events.md. Category, type and outcome of an event:
+`holdfast.events.ecs_categories`.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import socket
 from typing import TYPE_CHECKING, Any
 
 from holdfast._core import __version__
-from holdfast.events import security
+from holdfast.events import ecs_categories
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -78,7 +79,7 @@ def document(
     time: str, level: str, event: str, fields: Mapping[str, object], message: str
 ) -> dict[str, object]:
     """Returns the document of a log line. `message` is the line for people."""
-    meaning = security.meaning(event, fields)
+    meaning = ecs_categories.meaning(event, fields)
     about: dict[str, object] = {
         "kind": "event",
         "module": "holdfast",

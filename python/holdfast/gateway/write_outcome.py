@@ -1,6 +1,6 @@
 """What became of a write: the word for it in the log, and whether the device may have written.
 
-The outcome in a security event: `holdfast.events.security`.
+The outcome in a security event: `holdfast.events.ecs_categories`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The security events of the log, in the terms of the Elastic Common Schema (ECS).
+"""The security events of the log, with their category, type and outcome in the terms of ECS.
 
 The names, categories, types and outcomes are stable, see docs/security-events.md.
 """
