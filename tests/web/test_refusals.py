@@ -14,7 +14,7 @@ from holdfast.gateway import Settings
 from holdfast.gateway.operations import document as gateway_document
 from holdfast.gateway.refusals import FAILURE
 from holdfast.gateway.refusals import REFUSALS as OF_GATEWAY
-from holdfast.ingest import KEEPING
+from holdfast.ingest import REFUSED_FOR_NOW
 from holdfast.net.http.refusals import Refusal, Refusals, headers_with
 from support.paths import ROOT
 
@@ -37,7 +37,7 @@ def statuses(responses: Iterable[str]) -> set[int]:
 
 def test_every_reason_of_a_handler_has_a_status() -> None:
     assert raised("net/http", "gateway") == set(OF_GATEWAY.reasons)
-    of_rest = {*raised("net/http", "adapters/rest", "ingest"), *KEEPING}
+    of_rest = {*raised("net/http", "adapters/rest", "ingest"), *REFUSED_FOR_NOW}
     # Only a broker delivers old messages.
     assert of_rest - {"stale_command"} == set(OF_REST.reasons)
 

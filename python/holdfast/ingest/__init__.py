@@ -8,10 +8,10 @@ from __future__ import annotations
 from holdfast._core import Follower
 from holdfast.ingest.counts import Counts
 from holdfast.ingest.memory_access import Begun, Grant, MemoryAccess, Written
-from holdfast.ingest.refusals import KEEPING, Refused, unreadable
+from holdfast.ingest.refusals import REFUSED_FOR_NOW, Refused, unreadable
 
 __all__ = [
-    "KEEPING",
+    "REFUSED_FOR_NOW",
     "Begun",
     "Counts",
     "Follower",

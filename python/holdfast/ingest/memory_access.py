@@ -24,7 +24,7 @@ from holdfast.events.audit.chain import encoded
 from holdfast.ingest.audit_lines import Recording, origin_around, values_of
 from holdfast.ingest.counts import Counts
 from holdfast.ingest.refusals import (
-    KEEPING,
+    REFUSED_FOR_NOW,
     Refused,
     malformed,
     place_of,
@@ -553,8 +553,8 @@ class MemoryAccess:
             case "too_large":
                 detail = f"{refused.detail}; nothing has changed"
                 return Refused("too_large", detail, **place_of(*place))
-            case reason if reason in KEEPING:
-                return Refused(reason, KEEPING[reason], **place_of(*place))
+            case reason if reason in REFUSED_FOR_NOW:
+                return Refused(reason, REFUSED_FOR_NOW[reason], **place_of(*place))
             case "invalid_value" | "invalid_type" if refused.index is not None:
                 value = shown(values[refused.index])
                 wrong = "outside" if refused.reason == "invalid_value" else "not"

@@ -44,13 +44,14 @@ class Refused(Exception):
         return {"status": "rejected", "reason": self.reason, **places, "detail": self.detail}
 
 
-KEEPING = {
+REFUSED_FOR_NOW = {
     "busy": "too many writes wait to be stored; nothing has changed",
     "not_stored": "the file of the memory can't be written; nothing has changed",
     "log_unavailable": "the log of the memory can't be reached; nothing has changed",
     "not_confirmed": "the log did not confirm the write in time; it may still be carried out",
 }
-"""Why memories that are kept refuse writes for now: a later attempt may succeed."""
+"""Why memories that are kept refuse writes for now: a later attempt may succeed. So an MQTT message
+stays unacknowledged, and the broker sends it again."""
 
 
 def unreadable(error: OSError) -> str:

@@ -8,9 +8,9 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING
 
-from holdfast.adapters.mqtt.answers import Answers
 from holdfast.adapters.mqtt.connection import BrokerConnection
 from holdfast.adapters.mqtt.inbox import Filters, Inbox, Value
+from holdfast.adapters.mqtt.response_topics import Answers
 from holdfast.adapters.mqtt.sessions import session_of
 from holdfast.adapters.mqtt.subscriptions import Subscriptions
 from holdfast.events import log_lines

@@ -2,8 +2,8 @@
 
 - A message is acknowledged after it was written, with every quality of service. With QoS 2 paho
   sends PUBREC before it delivers the message, so a crash between the two would lose the message.
-- A message that a memory can't keep at the moment is not acknowledged, and ends the connection:
-  the broker sends it again after a reconnect.
+- A message that is `REFUSED_FOR_NOW` is not acknowledged, and ends the connection: the broker
+  sends it again after a reconnect.
 - The properties of a message are parsed here, in linear time.
 - A packet over the size limit is not kept in memory while it arrives.
 """
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.adapters.mqtt.inbox import MAX_PAYLOAD_BYTES
 from holdfast.adapters.mqtt.sessions import SESSION_EXPIRY_S
-from holdfast.ingest import KEEPING
+from holdfast.ingest import REFUSED_FOR_NOW
 from holdfast.net.mqtt.client import BrokerClient
 from holdfast.net.mqtt.packets import MAX_HEAD_BYTES, acknowledgement, parse_publish
 from holdfast.net.mqtt.stream import Packets
@@ -166,7 +166,7 @@ class BrokerConnection(BrokerClient):
             return
         is_known = message.qos == 2 and message.identifier in self._unreleased
         result = {} if is_known else self._inbox.take(message, stale=_staleness(message))
-        if message.qos and result.get("reason") in KEEPING:
+        if message.qos and result.get("reason") in REFUSED_FOR_NOW:
             self.end(str(result["detail"]))
             return
         # Before the answer: if the broker closes the connection because of that, it does not
