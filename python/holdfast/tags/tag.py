@@ -10,8 +10,9 @@ from typing import Any
 
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, WRITE_LIMITS
 from holdfast.tags.base import Marker, Scaled, TagError
+from holdfast.tags.rounding import Rounding
 from holdfast.tags.scale import Linear, RegisterScale, plain_number
-from holdfast.tags.writing import Rounding, WritableTag, unwritable
+from holdfast.tags.writing import WritableTag, unwritable
 from holdfast.types import AREAS, BIT_AREAS, Area
 from holdfast.values import (
     ConversionError,

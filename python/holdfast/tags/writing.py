@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from holdfast.protocol import WRITE_LIMITS
+from holdfast.tags.rounding import ROUNDING_OF_WRITES
 from holdfast.tags.scale import RegisterScale, ScaledTag, is_finite
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
@@ -15,18 +16,10 @@ from holdfast.values.numeric import float_for, nearest_float
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from holdfast.tags.rounding import Rounding
     from holdfast.tags.scale import Linear
     from holdfast.types import Area
     from holdfast.values.types import Type
-
-Rounding: TypeAlias = Literal["nearest", "exact"]
-"""What happens to a value between two values of the registers: rounded, or refused."""
-
-ROUNDING_OF_WRITES: Rounding = "exact"
-ROUNDING_OF_MESSAGES: Rounding = "nearest"
-"""Those of tags without `round`. A published measurement has more digits than registers; a value
-that somebody sets is meant as it stands.
-"""
 
 
 class WritableTag(ScaledTag):

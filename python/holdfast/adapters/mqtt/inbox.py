@@ -18,8 +18,8 @@ from holdfast.events.throttle import Throttle
 from holdfast.ingest import Grant, Refused
 from holdfast.ingest.refusals import MAX_SHOWN
 from holdfast.runtime.text import clip
+from holdfast.tags.rounding import ROUNDING_OF_MESSAGES
 from holdfast.tags.text import value_from
-from holdfast.tags.writing import ROUNDING_OF_MESSAGES
 from holdfast.values import ConversionError, codec_for
 
 if TYPE_CHECKING:

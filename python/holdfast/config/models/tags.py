@@ -17,7 +17,7 @@ from holdfast.config.text.messages import show
 from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, whole_number
 from holdfast.config.values.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
 from holdfast.tags import Tag, TagList
-from holdfast.tags.writing import Rounding
+from holdfast.tags.rounding import Rounding
 from holdfast.types import Area
 from holdfast.values.orders import DEFAULT_ORDER
 
