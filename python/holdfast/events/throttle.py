@@ -79,6 +79,8 @@ class Throttle:
 
     At most `most` kinds and origins are distinguished in a window, `of_source` of each source.
     Further subjects of a source are counted together, and so are events of further sources.
+
+    The defaults are for events in the log. The audit log has its own, in `audit.refusal_summaries`.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Resolves the host of a request to addresses that the egress list allows."""
+"""Finds the addresses of a request's host that `net.allow_list` allows; `pool` connects to them."""
 
 from __future__ import annotations
 

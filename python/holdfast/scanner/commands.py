@@ -1,6 +1,7 @@
 """Commands: a value, given as text, is written to coils or holding registers of a device.
 
-`fleet.nodes` says how long it waits for a node of a fleet.
+`Registry.commanded` says which tag a name means, `fleet.nodes` how long a command waits for another
+node of a fleet.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A stream looks at the memory at most once per `min_interval`, and only when its peer has taken the
 events before. So a slow peer receives the newest values, and nothing is queued for it. While the
 memory can't be read because its log is behind, or a range because what it mirrors is stale, a
-stream says so and waits.
+stream says so and waits. Which part of a range an event has: crates/memory/src/follower.rs.
 """
 
 from __future__ import annotations

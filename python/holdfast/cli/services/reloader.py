@@ -156,7 +156,7 @@ class Reloader:
         return FileSnapshot(files_of(self._file, config), hold=hold)
 
     def _is_replaced(self) -> bool:
-        """Whether watched files were replaced by a rename, and none was written in place."""
+        """Whether changed files are to be taken over, which `not_taken_over` decides."""
         config = self._appliance.config
         if self._file is None or config.reload != "on-change":
             return False

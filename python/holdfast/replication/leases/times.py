@@ -25,8 +25,9 @@ class LeaseTimes:
 
     @property
     def settle_s(self) -> float:
-        """After a lease was taken that was not given back, nothing is sent to a device for so long:
-        its holder may still use it. The same for all leases after their bucket was lost."""
+        """After a lease was taken that was not given back, writes wait for so long, and the timeout
+        of the device: its former holder may still use it. Polls wait only if the device has
+        `release`. The same for all leases after their bucket was lost."""
         return self.ttl_s
 
     @property

@@ -20,7 +20,7 @@ Block = TypeVar("Block", bound=tuple[Any, ...])
 """A tuple that begins with area, address and count."""
 
 TOLERATED_FAILURES = 1
-"""Consecutive scans without a response before a device is offline."""
+"""Consecutive scans without a response that leave a device online: at the second it is offline."""
 
 
 @dataclass(slots=True)
