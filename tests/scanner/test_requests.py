@@ -285,14 +285,14 @@ def test_devices_on_one_serial_line_have_the_same_settings(
 
     assert ask("one", "rtu:///dev/ttyNONE0?baud=9600")["success"]
     for url, error in (
-        ("rtu:///dev/ttyNONE0", "baud of /dev/ttyNONE0 is already 9600 for one, not 19200; dev"),
+        ("rtu:///dev/ttyNONE0", "baud of rtu:///dev/ttyNONE0 is already 9600 for one, not 19200; dev"),
         (
             "rtu:///dev/ttyNONE0?baud=9600&parity=none",
-            "parity of /dev/ttyNONE0 is already even for one",
+            "parity of rtu:///dev/ttyNONE0 is already even for one",
         ),
-        ("ascii:///dev/ttyNONE0?baud=9600", "mode of /dev/ttyNONE0 is already rtu for one"),
+        ("ascii:///dev/ttyNONE0?baud=9600", "mode of rtu:///dev/ttyNONE0 is already rtu for one"),
         ("rtu:///dev/ttyNONE0?baud=9600&silence=0.1", "is already the default for one, not 0.1"),
-        ("rtu:///dev/ttyNONE0?baud=9600&rs485=rts", "rs485 of /dev/ttyNONE0 is already"),
+        ("rtu:///dev/ttyNONE0?baud=9600&rs485=rts", "rs485 of rtu:///dev/ttyNONE0 is already"),
     ):
         assert error in ask("two", url)["error"]
     assert "baud 9600" in ask("one", "rtu:///dev/ttyNONE0", "y")["error"]
@@ -316,6 +316,7 @@ def test_devices_at_one_address_have_the_same_tolerance(
     assert ask("one", f"{place}?pad=1&retries=2")["success"]
     for url, error in (
         (place, "pad of {} is already True for one, not False; devices at one address have the"),
+        (place.replace("127.0.0.1", "[::ffff:127.0.0.1]"), "pad of {} is already True for one"),
         (f"{place}?pad=1&retries=1", "retries of {} is already 2 for one, not 1"),
         (
             f"{place}?pad=1&retries=2&accept_unit=any",

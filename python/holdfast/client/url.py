@@ -68,7 +68,10 @@ Target: TypeAlias = NetworkTarget | SerialTarget
 
 
 def connection_of(target: Target) -> str:
-    """The same text for all devices behind one connection or line, however it is written."""
+    """The same text for all spellings of a network address; TLS and TCP count as one.
+
+    A serial line has the name of its URL.
+    """
     if isinstance(target, SerialTarget):
         return f"serial:{target.device}"
     found = address_in(target.host)
@@ -85,6 +88,12 @@ def shared_connection(target: Target) -> tuple[str, str]:
     if isinstance(target, SerialTarget):
         return "", target.device
     return target.transport, connection_of(target)
+
+
+def physical_connection(target: Target) -> tuple[str, str]:
+    """`shared_connection`, but a serial line has the real path of its device."""
+    scheme, place = shared_connection(target)
+    return scheme, os.path.realpath(place) if isinstance(target, SerialTarget) else place
 
 
 def other_name(target: Target, connections: Iterable[tuple[str, str]]) -> str | None:

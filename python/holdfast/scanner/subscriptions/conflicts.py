@@ -6,7 +6,6 @@ or at one address share their settings. Who is the only one to use something may
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
@@ -97,7 +96,7 @@ def check_settings(target: Target, other: ScannedDevice) -> None:
         if known != settings[key]:
             at = "on one serial line" if isinstance(target, SerialTarget) else "at one address"
             raise Refused(
-                f"{key} of {connection_of(target)} is already {_setting_text(known)} for "
+                f"{key} of {shared} is already {_setting_text(known)} for "
                 f"{other.id}, not {_setting_text(settings[key])}; devices {at} have the same "
                 "settings"
             )
@@ -108,11 +107,6 @@ def _check_unused(conflict: str, users: list[str]) -> None:
     if users:
         more = f" and {len(users) - 1} more" if len(users) > 1 else ""
         raise Refused(f"{conflict}; {users[0]}{more} must unsubscribe first")
-
-
-def connection_of(target: Target) -> str:
-    """Returns the serial line, or the address, that identifies a connection."""
-    return os.path.realpath(target.device) if isinstance(target, SerialTarget) else str(target)
 
 
 def _described(source: Source) -> str:

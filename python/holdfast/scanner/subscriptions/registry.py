@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from holdfast.client.url import physical_connection
 from holdfast.scanner.dialects import TENTACLE, Dialect
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.subject_parts import subject_id
@@ -16,7 +17,6 @@ from holdfast.scanner.subscriptions.conflicts import (
     check_settings,
     check_subject,
     check_tags,
-    connection_of,
     merged,
     replaces,
 )
@@ -76,7 +76,7 @@ class Registry:
         """The tag ids that have another name in subjects, by this name."""
         self._subjects: dict[str, str] = {}
         """The ids of the devices, by their names in subjects."""
-        self._devices_by_connection: dict[str, list[str]] = {}
+        self._devices_by_connection: dict[tuple[str, str], list[str]] = {}
         """The ids of the devices that share a connection, by its address or line."""
 
     def known(self, subscription: Subscription) -> ScannedDevice | None:
@@ -185,7 +185,8 @@ class Registry:
             device.subscribers, device.tags = dict(former.subscribers), dict(former.tags)
             self._release_connection(former)
         self.devices[device.id] = device
-        self._devices_by_connection.setdefault(connection_of(source.target), []).append(device.id)
+        place = physical_connection(source.target)
+        self._devices_by_connection.setdefault(place, []).append(device.id)
         self._subjects |= dict.fromkeys(_subjects(device), device.id)
         return device
 
@@ -261,7 +262,7 @@ class Registry:
     def _check_shared(self, subscription: Subscription) -> None:
         """Checks that a device has the settings of others on its connection. Raises `Refused`."""
         target = subscription.source.target
-        sharing = self._devices_by_connection.get(connection_of(target), ())
+        sharing = self._devices_by_connection.get(physical_connection(target), ())
         # One is enough: each was compared with the others when it was added.
         other = next((id for id in sharing if id != subscription.device), None)
         if other is not None:
@@ -269,7 +270,7 @@ class Registry:
 
     def _release_connection(self, device: ScannedDevice) -> None:
         """Notes that a device does not use its connection any more."""
-        place = connection_of(device.source.target)
+        place = physical_connection(device.source.target)
         self._devices_by_connection[place].remove(device.id)
         if not self._devices_by_connection[place]:
             del self._devices_by_connection[place]
