@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from holdfast.importing import Imported
 
 NO_OUTPUT = (
-    "1: : check: values are not published: add outputs for what the command line of the source says"
+    "1: : check: values are not published: add outputs for what the command line of modpoll says"
 )
 
 COILS = [int(each) for each in "10000000110000001110000011110000"]
@@ -141,7 +141,7 @@ def test_numbers_have_the_same_values(
     found = read(NUMBERS.format(order=order))
     got = [round(each, 3) if isinstance(each, float) else each for each in values(tmp_path)]
     assert tuple(got) == expected
-    told = "' BE_BE' is none of BE_BE, BE_LE, LE_BE, LE_LE: read as BE_LE, as in the source"
+    told = "' BE_BE' is none of BE_BE, BE_LE, LE_BE, LE_LE: read as BE_LE, as in modpoll"
     assert notes(found) == [f"2: plant.poll: check: {told}"] * (order == " BE_BE")
 
 
@@ -196,8 +196,8 @@ def test_one_bit_of_coils_is_that_of_two_bytes(
     assert "".join(str(int(each)) for each in values(tmp_path)) == expected
     assert found.data["devices"]["plant"]["tags"]["a"]["writable"] is True
     told = {
-        "late": "5: plant.late: left out: the reply ended before its byte; the source had no value",
-        "last": "9: plant.last: left out: not in its poll, coil 23; the source had false",
+        "late": "5: plant.late: left out: the reply ended before its byte; modpoll had no value",
+        "last": "9: plant.last: left out: not in its poll, coil 23; modpoll had false",
     }
     assert [each for each in notes(found) if "left out" in each] == [told[it] for it in left_out]
 
@@ -210,7 +210,7 @@ def test_a_list_of_bits_ends_with_the_reply(read: Callable[[str], Imported]) -> 
     assert [tag["address"] for name, tag in tags.items() if name.startswith("b_")] == [
         *range(23, 15, -1)
     ]
-    told = "c: left out: the reply ended before its byte; the source had no value"
+    told = "c: left out: the reply ended before its byte; modpoll had no value"
     assert [each for each in notes(found) if "left out" in each] == [f"5: plant.{told}"]
 
 
@@ -240,19 +240,19 @@ def test_what_the_source_did_not_read_is_left_out(read: Callable[[str], Imported
     assert notes(found) == [
         "2: early: left out: no device is above it",
         "4: plant.early: left out: no poll that is read is above it",
-        "7: plant.same: left out: one has this address; the source read only the first reference",
+        "7: plant.same: left out: one has this address; modpoll read only the first reference",
         "8: plant.far: left out: not in its poll, holding_registers 0 to 9",
         "9: plant.set: left out: a reference that is not read; tags are",
-        "10: plant.byte: left out: 'uint8' is no type; the source had no value",
+        "10: plant.byte: left out: 'uint8' is no type; modpoll had no value",
         "11: plant.short: left out: a row of 4 cells, allowed: at least 5",
-        "12: plant.two: check: '#ref' is a ref, as in the source",
-        "12: plant.two: left out: '2 %' is no scale; the source ignored it",
+        "12: plant.two: check: '#ref' is a ref, as in modpoll",
+        "12: plant.two: left out: '2 %' is no scale; modpoll ignored it",
         "13: plant.poll-2: left out: found 'holding', allowed: coil, discrete_input, "
-        "holding_register, input_register; the source ignored it",
+        "holding_register, input_register; modpoll ignored it",
         "14: plant.none: left out: no poll that is read is above it",
         "16: plant.number: left out: 'uint16' is no type of coils here, allowed: bool, bool8, "
         "bool16",
-        "17: plant.late: left out: the reply ended before its byte; the source had no value",
+        "17: plant.late: left out: the reply ended before its byte; modpoll had no value",
         "18: idle: left out: no reference of it is read",
     ]
 
@@ -269,9 +269,9 @@ def test_a_comment_that_is_no_device_ends_neither_device_nor_poll(
         "plant": ["one"]
     }
     assert notes(found) == [
-        "2: typical: left out: found '1 <- the first one', no unit id; the source ignored it",
-        "5: '<device_name>': left out: found '<device_id>', no unit id; the source ignored it",
-        "7: spare: check: '#device' is a device, as in the source",
+        "2: typical: left out: found '1 <- the first one', no unit id; modpoll ignored it",
+        "5: '<device_name>': left out: found '<device_id>', no unit id; modpoll ignored it",
+        "7: spare: check: '#device' is a device, as in modpoll",
         "7: spare: left out: no reference of it is read",
     ]
 

@@ -84,8 +84,8 @@ def test_a_unit_becomes_a_device_that_is_forwarded(
         }
     }
     assert notes(found) == [
-        "2: replicator.units: check: if a read of a device fails, the others are written; the "
-        "source wrote none",
+        "2: replicator.units: check: if a read fails, the others are written; the "
+        "replicator wrote none",
         "3: replicator.units[0].id: changed: renamed to pump_1: a name has "
         "1 to 64 letters, digits, '_', '.' and '-'",
     ]
@@ -120,8 +120,8 @@ def test_settings_of_the_source_are_converted(
     ("old", "new", "note"),
     [
         ("timeout_ms: 1500", "timeout_ms: 0",
-         "4: replicator.units[0].source: check: no timeout_ms: 5 s; the source waited without an "
-         "end"),
+         "4: replicator.units[0].source: check: no timeout_ms: 5 s; the replicator waited without "
+         "an end"),
         ("interval_ms: 250", "interval_ms: 3",
          "16: replicator.units[0].poll.interval_ms: changed: raised to 10 ms, the shortest "
          "interval"),
@@ -132,7 +132,7 @@ def test_settings_of_the_source_are_converted(
          "14: replicator.units[0].targets[0].memories[0].offsets.16: left out: no read has this "
          "function, allowed: 1 to 4"),
         ("  units:", "  Status_Memory: {endpoint: 'a:1'}\n  units:",
-         "2: replicator.Status_Memory: left out: the source ignores it; each target has a "
+         "2: replicator.Status_Memory: left out: the replicator ignores it; each target has a "
          "status_unit_id"),
         ("replicator:", "listeners: []\nreplicator:",
          "1: listeners: left out: for the memories in this file, use: holdfast import mma"),
@@ -191,8 +191,8 @@ def test_a_note_names_what_is_not_converted_unchanged(
          "7: replicator.units[0].reads[0].addinvert: found true, allowed: false; nothing here "
          "inverts bits"),
         ("status_unit_id: 100", "status_unit_id: 0100",
-         "12: replicator.units[0].targets[0].status_unit_id: found 0100, which the source read as "
-         "octal, allowed: 64, or 100 if that is meant"),
+         "12: replicator.units[0].targets[0].status_unit_id: found 0100, which the replicator read "
+         "as octal, allowed: 64, or 100 if that is meant"),
         ("{3: 1000}", "{'3': 1000}",
          "14: replicator.units[0].targets[0].memories[0].offsets.3: found '3', allowed: a function "
          "from 1 to 4, without quotes"),
@@ -252,8 +252,8 @@ def test_a_target_that_got_nothing_gets_nothing(imported: Callable[[str], Import
     assert [each["unit"] for each in found.data["devices"]["pump_1"]["forward"]] == [2, 2]
     lost = ". It received the status block, which requires values here"
     reasons = [
-        "16: replicator.units[0].targets[1]: left out: its id is 300, more than 255: the source "
-        "wrote no values to it",
+        "16: replicator.units[0].targets[1]: left out: its id is 300, more than 255: the "
+        "replicator never wrote to it",
         "17: replicator.units[0].targets[2]: left out: no memories: it received no values",
     ]
     assert notes(found)[2:] == [f"{reason}{lost}" for reason in reasons]

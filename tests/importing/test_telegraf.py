@@ -117,7 +117,7 @@ def changed(old: str, new: str, text: str = REGISTER) -> str:
     return text.replace(old, new)
 
 
-NO_AGENT = "no agent in this file: 10 s, the default of the source"
+NO_AGENT = "no agent in this file: 10 s, the default of Telegraf"
 
 
 def notes(found: Imported) -> list[str]:
@@ -203,7 +203,7 @@ def test_metrics_become_devices(imported: Callable[[str], Imported]) -> None:
         "hours": {"area": "input_registers", "address": 8, "type": "uint32"},
         "ready": {"area": "holding_registers", "address": 20, "type": "bit:3"},
     }
-    bits = "bits without BOOL are true and false; the source had 1 and 0"
+    bits = "bits without BOOL are true and false; Telegraf had 1 and 0"
     assert notes(found) == [f"1: inputs.modbus[0]: changed: {bits}"]
 
 
@@ -298,7 +298,7 @@ def test_each_input_has_its_interval(imported: Callable[[str], Imported]) -> Non
     found = imported(changed("  slave_id", "  interval = 5\n  slave_id"))
     assert device(found)["interval"] == 10
     assert notes(found) == [
-        "5: inputs.modbus[0].interval: left out: the source ignored an interval that is not text; "
+        "5: inputs.modbus[0].interval: left out: Telegraf ignored an interval that is not text; "
         "see that of the agent"
     ]
 
@@ -307,7 +307,7 @@ def test_without_a_timeout_there_is_one_here(imported: Callable[[str], Imported]
     found = imported(changed('  timeout = "1500ms"\n', ""))
     assert device(found)["timeout"] == 1
     assert notes(found) == [
-        "3: inputs.modbus[0]: check: no timeout: 1 s; the source waited without an end"
+        "3: inputs.modbus[0]: check: no timeout: 1 s; Telegraf waited without an end"
     ]
 
 
@@ -349,13 +349,13 @@ def test_inputs_of_one_controller_share_its_settings(imported: Callable[[str], I
     found = imported(REGISTER + pauses + REQUEST)
     assert [each["tolerance"] for each in found.data["devices"].values()] == [{"pause": 0.02}] * 3
     assert notes(found) == [
-        "18: inputs.modbus[1]: changed: devices at one address share pauses and retries: those of "
-        "another input"
+        "18: inputs.modbus[1]: changed: devices at one address share pauses and retries: the "
+        "largest value of each applies"
     ]
     second = changed("baud_rate = 9600", "baud_rate = 19200", SERIAL)
     assert problems(imported, SERIAL + second) == [
-        "15: inputs.modbus[1].controller: found other settings of the line than the input in line "
-        "2 has, allowed: the same settings"
+        "15: inputs.modbus[1].controller: the serial settings differ from those of the input at "
+        "line 2 of the file, allowed: the same settings"
     ]
 
 
@@ -529,20 +529,20 @@ def field_of(settings: str) -> str:
 
 
 PLACE = "11: inputs.modbus[0].request[0].fields[0]"
-BEYOND = "changed: numbers beyond {} stay as they are; the source had other ones"
+BEYOND = "changed: numbers beyond {} stay as they are; Telegraf had other ones"
 
 
 @pytest.mark.parametrize(
     ("settings", "note"),
     [
         ('type="INT16", scale=0.1, output="INT64"',
-         f"{PLACE}.scale: changed: digits behind the point are kept; the source dropped them"),
+         f"{PLACE}.scale: changed: digits behind the point are kept; Telegraf dropped them"),
         ('type="INT16", output="UINT64"', f"{PLACE}.output: {BEYOND.format('UINT64')}"),
         ('type="UINT64", output="INT64"', f"{PLACE}.output: {BEYOND.format('INT64')}"),
         ('type="UINT16", scale=-2.0, output="UINT64"',
          f"{PLACE}.output: {BEYOND.format('UINT64')}"),
         ('type="INT64", scale=10.0, output="INT64"', f"{PLACE}.output: {BEYOND.format('INT64')}"),
-        ('type="BIT", scale=2.0', f"{PLACE}.scale: left out: the source ignored it for bits"),
+        ('type="BIT", scale=2.0', f"{PLACE}.scale: left out: Telegraf ignored it for bits"),
         ('type="INT16", digits=2', f"{PLACE}.digits: left out: unknown key"),
     ],
 )  # fmt: skip
@@ -572,7 +572,7 @@ def test_integers_of_the_style_register_are_not_truncated(
     found = imported(changed("scale=1.0", "scale=0.5"))
     assert notes(found) == [
         "14: inputs.modbus[0].input_registers[0].scale: changed: digits behind the point are "
-        "kept; the source dropped them"
+        "kept; Telegraf dropped them"
     ]
 
 
@@ -656,11 +656,11 @@ def test_text_in_half_of_each_register_is_left_out(imported: Callable[[str], Imp
          "6: inputs.modbus[0].configuration_type: found 'auto', allowed: register, request or "
          "metric"),
         ("10.0.0.5", "${PLC_HOST:-plc}",
-         "7: inputs.modbus[0].controller: found the environment variable PLC_HOST, which the "
-         "source replaces, allowed: its value"),
+         "7: inputs.modbus[0].controller: found the environment variable PLC_HOST, which "
+         "Telegraf replaces, allowed: its value"),
         ('name = "speed"', 'name = "$NAME"',
          "14: inputs.modbus[0].input_registers[0].name: found the environment variable NAME, "
-         "which the source replaces, allowed: its value"),
+         "which Telegraf replaces, allowed: its value"),
     ],
 )  # fmt: skip
 def test_what_would_be_wrong_is_refused(
@@ -708,7 +708,7 @@ def test_serial_lines_have_no_broadcasts(imported: Callable[[str], Imported]) ->
 def test_a_global_tag_may_be_named_tags(imported: Callable[[str], Imported]) -> None:
     text = REGISTER + '[global_tags]\n  tags = "$SITE"\n' + OUTPUT
     assert problems(imported, text) == [
-        "17: global_tags.tags: found the environment variable SITE, which the source replaces, "
+        "17: global_tags.tags: found the environment variable SITE, which Telegraf replaces, "
         "allowed: its value"
     ]
 
@@ -785,7 +785,7 @@ def test_a_type_that_influxdb_would_refuse_is_named(imported: Callable[[str], Im
     text = changed("scale=0.1", "scale=1.0", REGISTER + OUTPUT)
     text = changed(', data_type = "BOOL"', "", text)
     assert (
-        "16: outputs.influxdb_v2[0]: check: run, voltage have another type than in the source "
+        "16: outputs.influxdb_v2[0]: check: run, voltage have another type than in Telegraf "
         "(bits are booleans, whole numbers integers, those of uint64 floats); InfluxDB refuses "
         "them in the same measurement of a bucket: use another bucket"
     ) in notes(imported(text))
@@ -832,8 +832,8 @@ def test_nothing_is_dropped_silently(imported: Callable[[str], Imported]) -> Non
         "6: inputs.modbus[0].alias: left out: a device has one name",
         "7: inputs.modbus[0].fieldpass: left out: nothing is filtered: all tags are published",
         "8: inputs.modbus[0].colour: left out: unknown key",
-        "20: inputs.modbus[0].tags: left out: add an output with these tags, and with devices: "
-        "those of this input",
+        "20: inputs.modbus[0].tags: left out: add an output with these tags, and list the devices "
+        "of this input in its devices",
         "22: inputs.cpu: left out: not a Modbus input",
         "24: outputs.file: left out: add an output of type file, with format: influx for line "
         "protocol",
@@ -845,7 +845,7 @@ def test_nothing_is_dropped_silently(imported: Callable[[str], Imported]) -> Non
 def test_keys_of_other_styles_are_ignored(imported: Callable[[str], Imported]) -> None:
     text = REQUEST.replace("  timeout", "  slave_id = 9\n  timeout")
     assert notes(imported(text)) == [
-        "4: inputs.modbus[0].slave_id: left out: the source ignored it with configuration_type "
+        "4: inputs.modbus[0].slave_id: left out: Telegraf ignored it with configuration_type "
         "request"
     ]
 

@@ -285,7 +285,7 @@ def test_devices_on_one_serial_line_have_the_same_settings(
 
     assert ask("one", "rtu:///dev/ttyNONE0?baud=9600")["success"]
     for url, error in (
-        ("rtu:///dev/ttyNONE0", "baud of rtu:///dev/ttyNONE0 is already 9600 for one, not 19200; dev"),
+        ("rtu:///dev/ttyNONE0", "baud of rtu:///dev/ttyNONE0 is already 9600 for one, not 19200"),
         (
             "rtu:///dev/ttyNONE0?baud=9600&parity=none",
             "parity of rtu:///dev/ttyNONE0 is already even for one",

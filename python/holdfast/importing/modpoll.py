@@ -79,7 +79,7 @@ def read_modpoll(path: Path | str, url: str, interval_s: float = INTERVAL_S) -> 
     }
     if desk.report.problems:
         raise NotImportable(rows.file, desk.report.problems, desk.notes)
-    message = "values are not published: add outputs for what the command line of the source says"
+    message = "values are not published: add outputs for what the command line of modpoll says"
     desk.check((), message)
     return Imported(rows.file, "modpoll", "modpoll", {"devices": devices}, desk.notes)
 
@@ -210,10 +210,10 @@ def _devices(desk: Desk, rows: _Rows) -> Iterator[_Device]:
         is_comment = cells[0].lstrip().startswith("#")
         if kind == "device" and is_comment and is_whole and _integer(cells[2]) is None:
             # A comment on the form of devices: what follows is of the device before it.
-            desk.left_out(path, f"found {show(cells[2])}, no unit id; the source ignored it")
+            desk.left_out(path, f"found {show(cells[2])}, no unit id; modpoll ignored it")
             continue
         if cells[0].strip().lower() != kind and is_whole:
-            desk.check(path, f"{show(cells[0])} is a {kind}, as in the source")
+            desk.check(path, f"{show(cells[0])} is a {kind}, as in modpoll")
         if kind == "device" and (is_whole or cells[0].strip().lower() == kind):
             # The source gave what follows a device that is not valid to the one before it.
             unit = _integer(cells[2]) if is_whole else None
@@ -259,7 +259,7 @@ def _poll(desk: Desk, path: KeyPath, cells: list[str]) -> _Poll | None:
     start, size = _integer(cells[2]), _integer(cells[3])
     if area is None:
         words = ", ".join(_AREAS)
-        desk.left_out(path, f"found {show(cells[1])}, allowed: {words}; the source ignored it")
+        desk.left_out(path, f"found {show(cells[1])}, allowed: {words}; modpoll ignored it")
         return None
     most = _MAX_REGISTERS if area in REGISTER_AREAS else _MAX_BITS
     if start is None or size is None or size > most or not 0 <= start <= ADDRESSES - size:
@@ -269,7 +269,7 @@ def _poll(desk: Desk, path: KeyPath, cells: list[str]) -> _Poll | None:
     order = _ORDERS.get(cells[4].lower())
     if order is None and area in REGISTER_AREAS:
         message = f"{show(cells[4])} is none of BE_BE, BE_LE, LE_BE, LE_LE"
-        desk.check(path, f"{message}: read as BE_LE, as in the source")
+        desk.check(path, f"{message}: read as BE_LE, as in modpoll")
     return _Poll(area, start, size, order or _OTHER_ORDER)
 
 
@@ -295,7 +295,7 @@ def _take(desk: Desk, poll: _Poll, path: KeyPath, cells: list[str]) -> None:
     of_place = [each for each in poll.references if (each.address, each.bit) == (address, bit)]
     if of_place:
         first = of_place[0].name
-        desk.left_out(path, f"{first} has this address; the source read only the first reference")
+        desk.left_out(path, f"{first} has this address; modpoll read only the first reference")
     elif not poll.start <= address <= poll.end - reference.width:
         desk.left_out(path, f"not in its poll, {poll.area} {poll.start} to {poll.end - 1}")
     elif "r" not in rights:
@@ -323,7 +323,7 @@ def _scale(desk: Desk, path: KeyPath, text: str) -> float | None:
         found = float(text)
     except ValueError:
         if text.strip():
-            desk.left_out(path, f"{show(text)} is no scale; the source ignored it")
+            desk.left_out(path, f"{show(text)} is no scale; modpoll ignored it")
         return None
     if not math.isfinite(found):
         desk.problem(path, f"found the scale {show(text)}, allowed: a number")
@@ -352,7 +352,7 @@ def _tags(desk: Desk, poll: _Poll) -> Iterator[tuple[KeyPath, str, dict[str, Any
             order = {"order": poll.order} if has_order else {}
             yield each.path, each.name, {**place, "type": each.type, **order, **each.settings}
         else:
-            desk.left_out(each.path, f"{show(each.type)} is no type; the source had no value")
+            desk.left_out(each.path, f"{show(each.type)} is no type; modpoll had no value")
 
 
 def _bit_tags(desk: Desk, poll: _Poll) -> Iterator[tuple[KeyPath, str, dict[str, Any]]]:
@@ -374,7 +374,7 @@ def _bit_tags(desk: Desk, poll: _Poll) -> Iterator[tuple[KeyPath, str, dict[str,
             message = f"{show(each.type)} is no type of coils here, allowed: bool, bool8, bool16"
             desk.left_out(each.path, message)
         elif first + (0 if is_list else 8) >= poll.end:  # A list has what is left.
-            desk.left_out(each.path, "the reply ended before its byte; the source had no value")
+            desk.left_out(each.path, "the reply ended before its byte; modpoll had no value")
         elif each.bit is not None:
             # A bit of a number with 16 bits, whose first coil is the highest bit.
             bit = each.bit ^ 8 if poll.order in SWAPPED_BYTES else each.bit
@@ -383,7 +383,7 @@ def _bit_tags(desk: Desk, poll: _Poll) -> Iterator[tuple[KeyPath, str, dict[str,
                 place = {"area": poll.area, "address": coil, "type": "bool"}
                 yield each.path, each.name, {**place, **each.settings}
             else:
-                desk.left_out(each.path, f"not in its poll, coil {coil}; the source had false")
+                desk.left_out(each.path, f"not in its poll, coil {coil}; modpoll had false")
         else:
             # Each byte has its last coil first.
             coils = (first + 8 * byte + 7 - bit for byte in range(each.width) for bit in range(8))

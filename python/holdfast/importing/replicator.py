@@ -36,7 +36,7 @@ _AREAS: dict[int, Area] = dict(enumerate(AREAS, 1))
 
 _TOP_REASONS = {
     "listeners": "for the memories in this file, use: holdfast import mma",
-    "Status_Memory": "the source ignores it; each target has a status_unit_id",
+    "Status_Memory": "the replicator ignores it; each target has a status_unit_id",
 }
 
 _READ_REASONS = {"interval_ms": "each unit has one interval here, that of its poll"}
@@ -80,7 +80,7 @@ class _Units:
         if sections and not kept and not self.desk.report.problems:
             replicator.problem("units", "no unit has a target that is written")
         if kept:
-            partly = "if a read of a device fails, the others are written; the source wrote none"
+            partly = "if a read fails, the others are written; the replicator wrote none"
             replicator.check("units", partly)
         self._retry(kept.values())
         return kept
@@ -136,7 +136,7 @@ class _Units:
         given = source.integer("timeout_ms", -MAX_MS, MAX_MS, what="milliseconds")
         if given is not None and given > 0:
             return seconds(given)
-        message = f"no timeout_ms: {DEVICE_TIMEOUT_S} s; the source waited without an end"
+        message = f"no timeout_ms: {DEVICE_TIMEOUT_S} s; the replicator waited without an end"
         self.desk.check(source.path, message)
         return None
 
@@ -215,7 +215,7 @@ class _Units:
         if number is None or endpoint is None:
             return
         if number > MAX_UNIT:
-            message = f"its id is {number}, more than {MAX_UNIT}: the source wrote no values to it"
+            message = f"its id is {number}, more than {MAX_UNIT}: the replicator never wrote to it"
             self._leave_out(target, message, block)
             return
         if not offsets:

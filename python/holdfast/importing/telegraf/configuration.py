@@ -17,7 +17,7 @@ from holdfast.importing.notes import Desk
 from holdfast.importing.telegraf.durations import interval
 from holdfast.importing.telegraf.fields import MEASUREMENT, Field
 from holdfast.importing.telegraf.influx import Influx
-from holdfast.importing.telegraf.inputs import INTERVAL_S, Device, Input, share_connections
+from holdfast.importing.telegraf.inputs import INTERVAL_S, Device, InputReader, share_connections
 from holdfast.importing.telegraf.reasons import LOGGED, NO_COUNTERPART
 from holdfast.importing.telegraf.toml_document import VARIABLE, document
 from holdfast.runtime.text import listing
@@ -84,7 +84,7 @@ def _refuse_variables(desk: Desk) -> bool:
         for place, text in _texts(path, value):
             if (found := VARIABLE.search(text)) is not None:
                 name = found[1] or found[2]
-                message = f"found the environment variable {name}, which the source replaces"
+                message = f"found the environment variable {name}, which Telegraf replaces"
                 desk.problem(place, f"{message}, allowed: its value")
     return bool(desk.report.problems)
 
@@ -132,7 +132,7 @@ class _Import:
             self.interval = interval(agent) or INTERVAL_S
             agent.close({**dict.fromkeys(agent.data, NO_COUNTERPART), **_AGENT_REASONS})
         for one in self._sections("inputs", "modbus", "not a Modbus input", {}):
-            self.found += Input(one, self.interval).devices()
+            self.found += InputReader(one, self.interval).devices()
         if not self.found and not self.desk.report.problems:
             message = "no inputs.modbus with a field that can be converted, allowed: at least one"
             self.desk.problem(("inputs",), message)
@@ -218,7 +218,7 @@ class _Import:
         if names:
             some = listing(names[:_MAX_SHOWN_FIELDS])
             more = f" and {len(names) - _MAX_SHOWN_FIELDS} more" * (len(names) > _MAX_SHOWN_FIELDS)
-            message = f"{some}{more} have another type than in the source (bits are booleans, "
+            message = f"{some}{more} have another type than in Telegraf (bits are booleans, "
             message += "whole numbers integers, those of uint64 floats)"
             advice = "InfluxDB refuses them in the same measurement of a bucket: use another bucket"
             self.desk.check(output.path, f"{message}; {advice}")

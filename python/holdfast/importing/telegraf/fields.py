@@ -87,7 +87,7 @@ _OF_ONE_REGISTER = {"ABCD": "ABCD", "CDAB": "ABCD", "BADC": "BADC", "DCBA": "BAD
 
 _BIT_REASONS = dict.fromkeys(
     ("bit", "byte_order", "length", "scale", "type"),
-    "the source ignored it for coils and discrete inputs",
+    "Telegraf ignored it for coils and discrete inputs",
 )
 
 
@@ -152,7 +152,7 @@ class Fields:
     def _note_bits(self) -> None:
         found = [each for unit in self.units.values() for each in unit.fields if each.retyped]
         if any(each.tag.get("type", "bit:").startswith("bit:") for each in found):
-            message = "bits without BOOL are true and false; the source had 1 and 0"
+            message = "bits without BOOL are true and false; Telegraf had 1 and 0"
             self.source.desk.changed(self.source.path, message)
 
     def _unit(self, section: Section) -> Unit:
@@ -182,7 +182,7 @@ class Fields:
         if kind is not None and addresses and order is not None:
             found = self._of_registers(entry, kind, len(addresses), order)
         self._add(unit, entry, name, addresses, area, found, [entry])
-        entry.close({"bit": "the source used it for BIT only"})
+        entry.close({"bit": "Telegraf used it for BIT only"})
 
     def _data_type(self, entry: Section) -> str | None:
         if entry.get("data_type") == "FLOAT32":
@@ -279,7 +279,7 @@ class Fields:
 
     def _leave_out_tags(self, section: Section) -> None:
         if section.get("tags"):
-            message = "add an output with these tags, and with devices: that of this unit"
+            message = "add an output with these tags, and list this device in its devices"
             section.left_out("tags", message)
 
     def _gap(self, section: Section, default: int | None) -> int:
@@ -356,13 +356,13 @@ class Fields:
     def _bit(self, entry: Section, order: str) -> Typed | None:
         number = entry.integer("bit", 0, 15, what="a bit")
         if entry.get("scale"):
-            entry.left_out("scale", "the source ignored it for bits")
+            entry.left_out("scale", "Telegraf ignored it for bits")
         return {"type": f"bit:{number or 0}", **_order(_OF_ONE_REGISTER[order])}, True
 
     def _text(self, entry: Section, count: int, order: str) -> Typed | None:
         """Text of registers in their order, whatever the order of bytes is."""
         if entry.get("scale"):
-            entry.left_out("scale", "the source ignored it for text")
+            entry.left_out("scale", "Telegraf ignored it for text")
         if self.location in ("lower", "upper"):
             message = f"text in the {self.location} byte of each register: there is no such type"
             entry.desk.left_out(entry.path, f"{message}; read the registers as uint16[{count}]")
@@ -386,14 +386,14 @@ class Fields:
         is_whole = float(scale).is_integer()
         was_float = is_float or output == "FLOAT64"
         if not was_float and not is_whole:
-            entry.changed("scale", "digits behind the point are kept; the source dropped them")
+            entry.changed("scale", "digits behind the point are kept; Telegraf dropped them")
         if not was_float:
             key, kept = ("scale", kind) if output == "native" else ("output", output)
             factor = int(scale) if is_whole else scale
             ends = [factor * end for end in limits(_TYPES[kind])]
             least, most = limits(_TYPES[kept])
             if min(ends) < least or max(ends) > most:
-                message = f"numbers beyond {kept} stay as they are; the source had other ones"
+                message = f"numbers beyond {kept} stay as they are; Telegraf had other ones"
                 entry.changed(key, message)
         settings = {"type": _TYPES[kind]}
         settings |= _order(_OF_ONE_REGISTER[order] if _SIZES[kind] == 1 else order)

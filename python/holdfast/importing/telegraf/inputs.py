@@ -48,7 +48,7 @@ _INPUT_REASONS = {
     "log_level": LOGGED,
     "precision": "times are those of the replies, in microseconds",
     "startup_error_behavior": "a device that can't be reached is tried again",
-    "tags": "add an output with these tags, and with devices: those of this input",
+    "tags": "add an output with these tags, and list the devices of this input in its devices",
 }
 
 
@@ -64,7 +64,7 @@ class Device:
 
 
 @dataclass
-class Input:
+class InputReader:
     """Reads one input."""
 
     input: Section
@@ -80,12 +80,12 @@ class Input:
         url = self._url()
         timing = {"interval": self._interval(), "timeout": self._timeout()}
         location = self._workarounds()
-        self._busy()
+        self._read_busy_retries()
         fields = Fields(one, location)
         style = fields.read()
         self._rename_measurements(fields)
         others = {key for each in STYLES if each != style for key in STYLES[each]}
-        reason = f"the source ignored it with configuration_type {style}"
+        reason = f"Telegraf ignored it with configuration_type {style}"
         one.close(_INPUT_REASONS | dict.fromkeys(others - set(STYLES[style]), reason))
         made = []
         for number, unit in fields.units.items():
@@ -108,19 +108,19 @@ class Input:
     def _interval(self) -> float:
         given = self.input.get("interval")
         if given is not None and not isinstance(given, str):
-            message = "the source ignored an interval that is not text; see that of the agent"
+            message = "Telegraf ignored an interval that is not text; see that of the agent"
             self.input.left_out("interval", message)
             return self.agent_interval or INTERVAL_S
         found = interval(self.input)
         if found is None and self.agent_interval is None:
-            message = f"no agent in this file: {INTERVAL_S} s, the default of the source"
+            message = f"no agent in this file: {INTERVAL_S} s, the default of Telegraf"
             self.input.desk.check(self.input.path, message)
         return found or self.agent_interval or INTERVAL_S
 
     def _timeout(self) -> float:
         given = seconds(self.input, "timeout")
         if given is None:
-            message = f"no timeout: {TIMEOUT_S} s; the source waited without an end"
+            message = f"no timeout: {TIMEOUT_S} s; Telegraf waited without an end"
             self.input.desk.check(self.input.path, message)
             return TIMEOUT_S
         if given < MIN_TIME:
@@ -137,8 +137,8 @@ class Input:
             each.measurement = f"{prefix or ''}{override or each.measurement}{suffix or ''}"
             each.measured_at = self.input.at(given[0]) if given else each.measured_at
 
-    def _busy(self) -> None:
-        """Retries of a busy device."""
+    def _read_busy_retries(self) -> None:
+        """Reads how often a busy device is asked again."""
         times = self.input.integer("busy_retries", 0, 1_000_000)
         if self.input.get("busy_retries_wait") is not None:
             message = "the pause before a retry is at least 0.1 s; see pause of tolerance"
@@ -153,7 +153,7 @@ class Input:
         table = self.input.mapping("workarounds")
         if table is None:
             return None
-        for key, ours in (
+        for key, option in (
             ("pause_after_connect", "pause_after_connect"),
             ("pause_between_requests", "pause"),
         ):
@@ -161,17 +161,17 @@ class Input:
             if pause is not None and pause > MAX_PAUSE_S:
                 table.problem(key, f"found {pause} seconds, allowed: up to {MAX_PAUSE_S}")
             elif pause is not None:
-                self.tolerance[ours] = pause
+                self.tolerance[option] = pause
         if table.flag("close_connection_after_gather"):
             self.tolerance["close_after"] = 1
             message = "the connection is closed after each request"
             table.changed("close_connection_after_gather", message)
-        for key, ours, most in (
+        for key, option, most in (
             ("max_bit_registers_per_request", "max_bits", READ_BITS),
             ("max_word_registers_per_request", "max_registers", READ_REGISTERS),
         ):
             if number := table.integer(key, 0, most):
-                self.limits[ours] = number
+                self.limits[option] = number
         location = table.text("string_register_location")
         if location not in (None, "both", "lower", "upper"):
             message = f"found {show(location)}, allowed: both, lower or upper"
@@ -221,7 +221,7 @@ class Input:
         mode = self._mode(_NETWORK_MODES)
         for key in _SERIAL_KEYS:
             if self.input.get(key) is not None:
-                self.input.left_out(key, "the source used it for serial lines only")
+                self.input.left_out(key, "Telegraf used it for serial lines only")
         return None if port is None else f"{mode}://{joined(host, port)}"
 
     def _serial_url(self, device: str) -> str | None:
@@ -264,7 +264,10 @@ class Input:
 
 
 def share_connections(desk: Desk, devices: list[Device]) -> None:
-    """Devices at one address share a connection: its settings must be the same."""
+    """Gives devices at one address the same tolerance: the largest value of each setting.
+
+    Reports different settings of one serial line.
+    """
     groups: dict[str, list[Device]] = {}
     for each in devices:
         if each.data["url"] is not None:
@@ -277,16 +280,16 @@ def share_connections(desk: Desk, devices: list[Device]) -> None:
             _compare_lines(desk, group[0], each)
         for each in group:
             if each.data.get("tolerance", {}) != shared:
-                message = "devices at one address share pauses and retries: those of another input"
-                desk.changed(each.path[:-1], message)
+                message = "devices at one address share pauses and retries"
+                desk.changed(each.path[:-1], f"{message}: the largest value of each applies")
                 each.data["tolerance"] = dict(shared)
 
 
 def _compare_lines(desk: Desk, first: Device, other: Device) -> None:
-    """Refuses different settings of one serial line."""
+    """Reports different settings of one serial line."""
     one, two = parse(first.data["url"]), parse(other.data["url"])
     if one != two and isinstance(one, SerialTarget):
         line = desk.document.place(first.path, of_key=True).line
-        message = f"found other settings of the line than the input in line {line} has"
+        message = f"the serial settings differ from those of the input at line {line} of the file"
         path = (*other.path[:-1], "controller")
         desk.problem(path, f"{message}, allowed: the same settings")
