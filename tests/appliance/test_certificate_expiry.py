@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import sys
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
@@ -13,8 +14,8 @@ import pytest
 from holdfast.appliance.parts.certificate_expiry import (
     KINDS,
     CertificateExpiry,
-    doubts,
     expiries,
+    warnings,
 )
 from holdfast.config import Config, load
 from holdfast.config.models.base import Model
@@ -251,6 +252,15 @@ def test_the_expiry_of_each_configured_file_is_found(pems: Pems) -> None:
     found = expiries(config)
     assert found["certificates"].keys() == pems.certificates
     assert found["revocation_lists"].keys() == pems.lists
-    warned = doubts(config)
+    warned = warnings(config)
     assert all(" expires in 1 day, on " in text for _, text in warned)
     assert {general(place) for place, _ in warned} == EXPIRING | URLS
+
+
+def test_the_warning_without_cryptography_says_what_requires_it(
+    pems: Pems, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = pems.configuration()
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    [(_, text)] = warnings(config)
+    assert text.startswith("checking the dates of certificates requires cryptography, not ")

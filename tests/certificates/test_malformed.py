@@ -47,7 +47,7 @@ def test_a_file_is_either_usable_or_named_as_unusable(tmp_path: Path, text: byte
         inspection.describe,
         expiry.of_certificates,
         expiry.of_revocation_lists,
-        expiry.nameless,
+        expiry.missing_name_warning,
         lambda file: Https(HttpsFiles(file, file)),
     ):
         with contextlib.suppress(pem.UnusableFile):

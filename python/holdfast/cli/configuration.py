@@ -46,22 +46,22 @@ def load_whole(path: Path | str) -> Config:
 def _load_whole(path: Path | str) -> Config:
     config, document = loaded(path)
     problems: dict[KeyPath, str] = {}
-    doubts: list[tuple[KeyPath, str]] = []
+    warnings: list[tuple[KeyPath, str]] = []
     for place, check in _checks(config):
         try:
-            doubts += [(place, warning) for warning in check()]
+            warnings += [(place, warning) for warning in check()]
         except (OSError, ValueError) as error:
             problems[place] = str(error)
     if not problems:
-        doubts += certificate_expiry.doubts(config)
+        warnings += certificate_expiry.warnings(config)
     report = Report(document)
     for place, message in problems.items():
         report.add(place, message)
     if problems:
         raise ConfigError(str(path), report.problems)
-    for place, message in doubts:
+    for place, message in warnings:
         report.warn(place, message)
-    return config.with_warnings([*config.warnings, *report.warnings]) if doubts else config
+    return config.with_warnings([*config.warnings, *report.warnings]) if warnings else config
 
 
 def _checks(config: Config) -> Iterator[tuple[KeyPath, Callable[[], Iterable[str]]]]:

@@ -12,6 +12,7 @@ from holdfast.config.fingerprint import tls_of_url
 from holdfast.config.models.base import Model
 from holdfast.config.models.server_tls import HttpsConfig, ServerTlsConfig
 from holdfast.events import log_lines
+from holdfast.net.certificates import EXPIRY_NOTICE
 from holdfast.runtime import extras
 
 if TYPE_CHECKING:
@@ -26,9 +27,6 @@ Kind: TypeAlias = Literal["server", "certificates", "revocation_lists"]
 
 Expiries: TypeAlias = "dict[str, dict[str, float]]"
 """The earliest expiry in each configured file, in seconds of Unix time, by the kind of files."""
-
-WARN_WITHIN_S = 30 * 24 * 3600.0
-"""A certificate that expires within this time is logged."""
 
 REPEAT_S = 24 * 3600.0
 """A certificate is logged again after this time."""
@@ -84,7 +82,7 @@ class CertificateExpiry(Part):
         for kinds, ends in expiries.items():
             kind = kinds.removesuffix("s").replace("_", " ")
             for file, end in ends.items():
-                if end - now > WARN_WITHIN_S:
+                if end - now > EXPIRY_NOTICE.total_seconds():
                     continue
                 event = "certificate_expired" if end <= now else "certificate_expires"
                 logged = self._logged.get((event, kind, file))
@@ -107,19 +105,19 @@ def expiries(config: Config) -> Expiries:
     return found
 
 
-def doubts(config: Config) -> list[tuple[KeyPath, str]]:
+def warnings(config: Config) -> list[tuple[KeyPath, str]]:
     """Returns warnings about the certificates, each with its key."""
     found: dict[str, tuple[KeyPath, str]] = {}
     reason = extras.missing("certs")
     for each in _named(config):
         if reason is not None:
-            return [(each.place, f"its dates are not checked, which {reason}")]
+            return [(each.place, f"checking the dates of certificates {reason}")]
         from holdfast.net.certificates import expiry
 
         now = expiry.now()
-        texts = [one.doubt(now) for one in _dates(each) if one.is_valid(now) or not each.by_core]
+        texts = [one.warning(now) for one in _dates(each) if one.is_valid(now) or not each.by_core]
         if each.kind == "server":
-            texts.append(expiry.nameless(each.file))
+            texts.append(expiry.missing_name_warning(each.file))
         for text in texts:
             if text is not None:
                 warning = f"{each.file}: {text}"

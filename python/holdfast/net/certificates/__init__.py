@@ -4,3 +4,8 @@ TLS itself is elsewhere: `holdfast_engine::tls` for Modbus, `holdfast.net.http` 
 """
 
 from __future__ import annotations
+
+from datetime import timedelta
+
+EXPIRY_NOTICE = timedelta(days=30)
+"""A certificate that expires within this time gives a warning."""

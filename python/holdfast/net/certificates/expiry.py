@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from cryptography import x509
 
+from holdfast.net.certificates import EXPIRY_NOTICE
 from holdfast.net.certificates.parser import MALFORMED, certificates, revocation_lists
 from holdfast.runtime.text import counted
 
 if TYPE_CHECKING:
     from holdfast.net.certificates.pem import File
-
-SOON = timedelta(days=30)
-"""A certificate that expires within this time gives a warning."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +29,13 @@ class Expiry:
         """Whether it is valid now."""
         return self.begins <= now < self.ends
 
-    def doubt(self, now: datetime) -> str | None:
-        """Returns why it is not valid, or soon will not be; `None` if there is no doubt."""
+    def warning(self, now: datetime) -> str | None:
+        """Returns why it is not valid, or soon will not be; `None` if it is and stays valid."""
         if self.ends <= now:
             return f"{self.what} expired on {self.ends:%Y-%m-%d}"
         if self.begins > now:
             return f"{self.what} is not valid before {self.begins:%Y-%m-%d %H:%M} UTC"
-        if self.ends - now <= SOON:
+        if self.ends - now <= EXPIRY_NOTICE:
             days = (self.ends - now).days
             left = "less than a day" if days < 1 else counted(days, "day")
             return f"{self.what} expires in {left}, on {self.ends:%Y-%m-%d}"
@@ -75,7 +73,7 @@ def of_revocation_lists(file: File) -> list[Expiry]:
         return []
 
 
-def nameless(cert_file: File) -> str | None:
+def missing_name_warning(cert_file: File) -> str | None:
     """Returns why no client can match the certificate with a name or an address, or `None`."""
     try:
         own = certificates(cert_file)[0]

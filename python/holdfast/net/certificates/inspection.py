@@ -166,10 +166,10 @@ def _of_certificate(certificate: x509.Certificate) -> Described:
 
 def _judge_dates(certificate: x509.Certificate, item: Described) -> None:
     dates = of_certificate(certificate, "the certificate")
-    doubt = dates.doubt(now())
-    if doubt is not None:
+    warning = dates.warning(now())
+    if warning is not None:
         valid = dates.is_valid(now())
-        (item.advice if valid else item.flaws).append(doubt if valid else f"R-47: {doubt}")
+        (item.advice if valid else item.flaws).append(warning if valid else f"R-47: {warning}")
 
 
 def _judge_key(certificate: x509.Certificate, item: Described) -> None:
@@ -236,9 +236,9 @@ def _of_list(read: x509.CertificateRevocationList) -> Described:
     if lacks is not None:
         item.advice.append(f"the list {lacks}")
     if ends is not None:
-        doubt = Expiry("the list", read.last_update_utc, ends).doubt(now())
-        if doubt is not None:
-            (item.flaws if ends <= now() else item.advice).append(doubt)
+        warning = Expiry("the list", read.last_update_utc, ends).warning(now())
+        if warning is not None:
+            (item.flaws if ends <= now() else item.advice).append(warning)
     return item
 
 
