@@ -364,14 +364,14 @@ def test_one_entry_makes_many_devices(tmp_path: Path) -> None:
         ("'m{n}': {for: {n: 1-3}, url: 'tcp://a{m}', unit: 1}", "devices.'m{n}': found {m}, "),
         (
             "'m{n}': {for: {n: 1-3}, url: 'tcp://10.0.0.{ n }', unit: 1}",
-            "devices.'m{n}': found { n }, allowed: {n}; with at least three digits {n:03}",
+            "devices.'m{n}': found { n }, allowed: {n}, {n:03} for at least three digits",
         ),
         ("'m{n}': {for: {n: 1-3}, url: 'tcp://a{n:2}'}", "devices.'m{n}': found {n:2}, allowed: "),
         ("'m{n}': {for: {n: 3-1}, url: tcp://a}", "devices.'m{n}'.for.n: found '3-1', allowed: as"),
         ("'m{n}': {for: 3, url: tcp://a}", "devices.'m{n}'.for: found 3, allowed: as in"),
         ("'m{n}': {for: {}, url: tcp://a}", "devices.'m{n}'.for: found an empty mapping"),
-        ("m: {for: {n: 1-3}, url: tcp://a}", "devices.m: makes a second device with the name 'm'"),
-        ("'m{n}': {for: {n: 1-10001}, url: tcp://a}", "devices.'m{n}'.for: makes more than 10000"),
+        ("m: {for: {n: 1-3}, url: tcp://a}", "devices.m: a second device has the name 'm'"),
+        ("'m{n}': {for: {n: 1-10001}, url: tcp://a}", "devices.'m{n}'.for: the file would have"),
         ("'m{n}': {for: {n: 0-300}, url: tcp://a, unit: '{n}'}", "devices.'m{n}'.unit: found 256"),
         (
             "a: {url: tcp://a, profile: x, interval: 1}",
@@ -435,7 +435,7 @@ QUOTES = "allowed: 1 to 64 letters, digits, '_', '.' and '-'; quote it to make i
         (DEVICE + LISTENER % "{memory: plant}", ["memories: missing, allowed: a mapping"]),
         (
             "devices: {'d{n}': {for: {n: 1-999999999}, url: tcp://a, interval: 1}}\n",
-            ["makes more than 10000 devices, allowed: up to 10000"],
+            ["the file would have more than 10000 devices, allowed: up to 10000"],
         ),
         (
             DEVICE + "outputs: {n: {type: nats, servers: 'nats://u:s3cret@h'}}\n",

@@ -43,14 +43,14 @@ from holdfast.config.values.scalars import (
     whole_number,
 )
 from holdfast.config.values.scanner_settings import (
+    DEFAULT_MAX_DEVICES,
+    DEFAULT_MAX_TAGS,
     DIALECT,
     MAX_DEADBAND,
-    MAX_DEVICES,
     MAX_PARTITIONS,
     MAX_PING_INTERVAL,
     MAX_PINGS,
     MAX_SCAN_RATE,
-    MAX_TAGS,
     MAX_TIMEOUT,
     MIN_PING_INTERVAL,
     MIN_SCAN_RATE,
@@ -234,9 +234,9 @@ class MqttConfig(BrokerConfig):
 class NatsLimitsConfig(Model):
     """Limits on what subscribers of the scanner can request."""
 
-    devices: Annotated[int, Field(ge=1)] = MAX_DEVICES
+    devices: Annotated[int, Field(ge=1)] = DEFAULT_MAX_DEVICES
     """Maximum number of devices polled at once."""
-    tags: Annotated[int, Field(ge=1)] = MAX_TAGS
+    tags: Annotated[int, Field(ge=1)] = DEFAULT_MAX_TAGS
     """Maximum number of tags of all devices."""
 
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from holdfast.config.text.report import Report
     from holdfast.config.text.yaml_document import KeyPath
 
-MAX_DEVICES = 10_000
-"""The most devices of one file."""
+MAX_EXPANDED_DEVICES = 10_000
+"""The most devices of a file with `for`. Without `for`, their number has no limit."""
 
 _FIELD = re.compile(r"\{([A-Za-z_][A-Za-z0-9_]*)(?::(0[1-9]))?\}")
 _BRACES = re.compile(r"\{([^{}]*)\}")
@@ -51,14 +51,12 @@ def expand_templates(report: Report) -> None:
                 content = _filled(plain, values)
             except KeyError as error:
                 known = listing(f"{{{each}}}" for each in values)
-                digits = f"; with at least three digits {{{next(iter(values))}:03}}"
-                report.add_key(path, f"found {{{error.args[0]}}}, allowed: {known}{digits}")
+                padded = f"{{{next(iter(values))}:03}} for at least three digits"
+                report.add_key(path, f"found {{{error.args[0]}}}, allowed: {known}, {padded}")
                 break
-            if len(made) >= MAX_DEVICES:
-                report.add(
-                    (*path, "for"),
-                    f"makes more than {MAX_DEVICES} devices, allowed: up to {MAX_DEVICES}",
-                )
+            if len(made) >= MAX_EXPANDED_DEVICES:
+                message = f"the file would have more than {MAX_EXPANDED_DEVICES} devices"
+                report.add((*path, "for"), f"{message}, allowed: up to {MAX_EXPANDED_DEVICES}")
                 break
             places.setdefault(named, places[name])
             report.templates[named] = name
@@ -68,7 +66,7 @@ def expand_templates(report: Report) -> None:
 
 def _keep(report: Report, made: dict[Any, Any], name: object, device: Any, path: KeyPath) -> None:
     if name in made:
-        report.add_key(path, f"makes a second device with the name {show(name)}")
+        report.add_key(path, f"a second device has the name {show(name)}")
     else:
         made[name] = device
 
@@ -89,7 +87,7 @@ def _values(report: Report, path: KeyPath, given: object) -> list[dict[str, int]
             report.add((*path, variable), f"found {show(span)}, {_ALLOWED}")
             return []
         numbers.append(found)
-    combined = itertools.islice(itertools.product(*numbers), MAX_DEVICES + 1)
+    combined = itertools.islice(itertools.product(*numbers), MAX_EXPANDED_DEVICES + 1)
     return [dict(zip(given, each, strict=True)) for each in combined]
 
 
@@ -102,7 +100,7 @@ def _numbers(span: object) -> range | list[int] | None:
     if match is None or int(match[1]) > int(match[2]):
         return None
     first, last = int(match[1]), int(match[2])
-    return range(first, min(last, first + MAX_DEVICES) + 1)
+    return range(first, min(last, first + MAX_EXPANDED_DEVICES) + 1)
 
 
 def _filled(value: Any, values: Mapping[str, int]) -> Any:

@@ -21,9 +21,9 @@ PREFIX = "modbus"
 PREFIX_FORM = "letters, digits, '_' and '-', separated by dots"
 POLLABLE_FORM = f"{SOURCE_FORM}, or a serial device, as in /dev/ttyUSB0 or COM3"
 
-MAX_DEVICES = 5000
-MAX_TAGS = 500_000
-"""Default limits of the scanner; `MAX_TAGS` counts the tags of all devices."""
+DEFAULT_MAX_DEVICES = 5000
+DEFAULT_MAX_TAGS = 500_000
+"""Limits of the scanner; `DEFAULT_MAX_TAGS` counts the tags of all devices."""
 
 Dialect = Literal["tentacle", "tentacle-next"]
 """The programs that the scanner serves; `tentacle` is tentacle-modbus and its callers."""

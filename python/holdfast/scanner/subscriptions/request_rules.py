@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from holdfast.config.values.scanner_settings import (
-    MAX_DEVICES,
+    DEFAULT_MAX_DEVICES,
+    DEFAULT_MAX_TAGS,
     MAX_SCAN_RATE,
-    MAX_TAGS,
     MAX_TIMEOUT,
     MIN_SCAN_RATE,
     MIN_TIMEOUT,
@@ -33,8 +33,8 @@ class ScannerLimits:
     Without limits, any caller could exhaust memory.
     """
 
-    devices: int = MAX_DEVICES
-    tags: int = MAX_TAGS
+    devices: int = DEFAULT_MAX_DEVICES
+    tags: int = DEFAULT_MAX_TAGS
     """Tags of all devices together."""
     device_tags: int = 10_000
     """Tags of one device."""
