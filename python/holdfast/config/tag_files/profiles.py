@@ -10,7 +10,7 @@ from holdfast.config.tag_files.read import KINDS, load_profile
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError
 from holdfast.config.text.raw_access import entries, mapping
-from holdfast.config.values.scalars import NAME_FORM, is_name, path_of_file
+from holdfast.config.values.scalars import NAME_FORM, check_file_path, is_name
 from holdfast.runtime.text import either
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ class ProfileFiles:
             self.report.add(path, f"found {show(file)}, allowed: a file {either(KINDS)}")
             return
         try:
-            path_of_file(file)
+            check_file_path(file)
         except ValueError as error:
             self.report.add(path, str(error))
             return

@@ -29,15 +29,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from holdfast.client.base import MAX_INTERVAL_S
-from holdfast.client.url import (
-    FORMS,
-    RECEIVER_FORM,
-    Receiver,
-    in_folder,
-    parse,
-    parse_receiver,
-    receiver_in_folder,
-)
+from holdfast.client.url import FORMS, RECEIVER_FORM, in_folder, receiver_in_folder
 from holdfast.config.text.messages import PATH_QUOTES, shape, show, show_file
 from holdfast.config.values.allow_entries import parse_allowed
 from holdfast.config.values.host_names import parse_host_name
@@ -150,32 +142,21 @@ def _checked(parse: Callable[[object], object]) -> Callable[[object], str]:
     return text
 
 
-def parse_url(value: object) -> str:
-    """Checks the URL of a device. Raises `ValueError` for anything else."""
+def _without_nul(value: object, forms: str) -> str:
+    """Checks that a URL is text without NUL. `forms` are the allowed URLs."""
     if not isinstance(value, str):
-        raise ValueError(f"found {show(value)}, allowed: {FORMS}")
+        raise ValueError(f"found {show(value)}, allowed: {forms}")
     if "\0" in unquote(value):
         raise ValueError(f"found {show(value)}, allowed: a URL without NUL")
-    parse(value)
     return value
 
 
 def _device_url(value: object, info: ValidationInfo) -> str:
-    return in_folder(parse_url(value), _folder(info))
-
-
-def parse_receiver_url(value: object) -> Receiver:
-    """Parses the URL of a receiver. Raises `ValueError` for anything else."""
-    if not isinstance(value, str):
-        raise ValueError(f"found {show(value)}, allowed: {RECEIVER_FORM}")
-    if "\0" in unquote(value):
-        raise ValueError(f"found {show(value)}, allowed: a URL without NUL")
-    return parse_receiver(value)
+    return in_folder(_without_nul(value, FORMS), _folder(info))
 
 
 def _receiver_url(value: object, info: ValidationInfo) -> str:
-    parse_receiver_url(value)
-    return receiver_in_folder(str(value), _folder(info))
+    return receiver_in_folder(_without_nul(value, RECEIVER_FORM), _folder(info))
 
 
 def integral(value: object) -> object:
@@ -198,11 +179,14 @@ def _folder(info: ValidationInfo) -> Path:
 def _in_folder(value: object, info: ValidationInfo) -> object:
     if not isinstance(value, str):
         return value
-    return _folder(info) / path_of_file(value)
+    return _folder(info) / check_file_path(value)
 
 
-def path_of_file(value: str) -> str:
-    """Checks the path of a file. Raises `ValueError` for one that no file has, or a wrong quote."""
+def check_file_path(value: str) -> str:
+    """Raises `ValueError` if a path is empty or has a control character.
+
+    An escape of YAML, in a quoted path of Windows, makes such a character.
+    """
     if not value:
         raise ValueError(f"found {show(value)}, allowed: the path of a file")
     for character in value:
