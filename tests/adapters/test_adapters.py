@@ -17,6 +17,7 @@ from holdfast.adapters.plugins import UnknownAdapter
 from holdfast.appliance.services import supervision as supervisor
 from holdfast.appliance.services.supervision import Supervisor
 from support import wire
+from support.cli import invoke
 from support.paths import EXAMPLES
 from support.running import endpoint
 
@@ -118,9 +119,15 @@ def test_an_adapter_without_the_right_writes_nothing(run: Run, port: int) -> Non
     assert appliance.memories["plant"].read("input_registers", 2, 1) == [0]
 
 
-def test_an_adapter_that_is_not_installed_is_told(run: Run, port: int) -> None:
+def test_an_adapter_that_is_not_installed_is_told(run: Run, port: int, tmp_path: Path) -> None:
+    text = CONFIGURATION.format(type="nonesuch", access="read-only", port=port)
     with pytest.raises(UnknownAdapter, match=r"adapters\.text\.type: found 'nonesuch', installed"):
-        run(CONFIGURATION.format(type="nonesuch", access="read-only", port=port))
+        run(text)
+    file = tmp_path / "plant.yaml"
+    file.write_text(text)
+    result = invoke("run", str(file))
+    assert result.exit_code == 2
+    assert f"holdfast: {file}: adapters.text.type: found 'nonesuch', inst" in result.stderr
 
 
 class Scripted:

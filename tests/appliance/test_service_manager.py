@@ -226,13 +226,13 @@ def test_a_stalled_thread_starves_the_watchdog(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(command, "Appliance", Appliance)
     monkeypatch.setattr(command, "Signals", Signals)
     monkeypatch.setattr(command, "ServiceManager", Recorder)
-    for skipped in ("allow_open_files", "yield_interpreter"):
+    for skipped in ("allow_open_files", "lengthen_switch_interval"):
         monkeypatch.setattr(command, skipped, lambda *_: 0)
-    monkeypatch.setattr(command, "spare_what_stays", lambda: steps.append("freeze"))
+    monkeypatch.setattr(command, "freeze_garbage_collector", lambda: steps.append("freeze"))
     monkeypatch.setattr("holdfast.events.log_lines.configure", lambda *_: None)
     log = SimpleNamespace(level="info", format="text")
     settings: Any = SimpleNamespace(log=log, warnings=())
-    command.serve(settings, lambda _: "served", named="test")
+    command.serve(settings, lambda _: "served")
     assert steps == [
         "start",
         "freeze",

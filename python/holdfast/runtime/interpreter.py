@@ -1,4 +1,4 @@
-"""What a process that serves asks of its Python interpreter."""
+"""Settings of the Python interpreter for a process that serves."""
 
 from __future__ import annotations
 
@@ -81,13 +81,13 @@ def complete_hashlib() -> None:
         importlib.reload(hashlib)
 
 
-def yield_interpreter() -> None:
-    """Makes this process switch threads of the interpreter less often, in favor of native ones."""
+def lengthen_switch_interval() -> None:
+    """Lets a Python thread run longer before another: each switch delays native threads."""
     sys.setswitchinterval(SWITCH_INTERVAL_S)
 
 
-def spare_what_stays() -> None:
-    """Takes all present objects out of the garbage collections that follow, and has fewer of these.
+def freeze_garbage_collector() -> None:
+    """Excludes all present objects from garbage collection, and makes collections less frequent.
 
     Modules and configuration stay to the end. A collection that looks at all of them takes 20 to
     30 ms, in which nothing in Python is answered.

@@ -87,7 +87,6 @@ def _serve(file: Path, control: ServiceControl) -> None:
     serve(
         config,
         lambda _: f"{file} is served.",
-        named=str(file),
         file=file,
         control=control,
     )

@@ -112,7 +112,7 @@ def gateway(
         log = {"format": log_format}
         return _checked(Config.model_validate({"gateway": settings, "log": log}))
 
-    serve(load(), _greeting, named="gateway", load=load, retries_ports=False)
+    serve(load(), _greeting, load=load, retries_ports=False)
 
 
 def _tokens(file: Path) -> tuple[token_file.Token, ...]:

@@ -139,7 +139,6 @@ def proxy(
     serve(
         config,
         lambda appliance: _greeting(appliance, config, target, unit),
-        named="proxy",
         load=lambda: config,  # The files in the URL are read anew.
     )
 

@@ -36,7 +36,7 @@ from holdfast.events.writer import announce
 from holdfast.net.addresses import joined, reachable
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.runtime.bounded_files import Unreadable
-from holdfast.runtime.interpreter import spare_what_stays, yield_interpreter
+from holdfast.runtime.interpreter import freeze_garbage_collector, lengthen_switch_interval
 from holdfast.runtime.text import file_error_text
 from holdfast.types import BIT_AREAS, REGISTER_AREAS
 
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
 SOURCE = {"source": "holdfast sessions"}
 
 # Maximum number of devices in the greeting.
-MAX_DEVICES = 10
+MAX_DEVICES_SHOWN = 10
 
 # mbpoll's number for each area. Registers come first, as they are the better example.
 MBPOLL_TYPES = {
@@ -79,14 +79,13 @@ def run(file: Path) -> None:
     metrics are retried until they are free.
     """
     config = load_or_exit(file, shows_warnings=False)
-    serve(config, lambda appliance: _greeting(appliance, file), named=str(file), file=file)
+    serve(config, lambda appliance: _greeting(appliance, file), file=file)
 
 
 def serve(
     config: Config,
     greeting: Callable[[Appliance], str],
     *,
-    named: str,
     file: Path | None = None,
     load: Callable[[], Config] | None = None,
     retries_ports: bool = True,
@@ -102,7 +101,7 @@ def serve(
     log_lines.configure(config.log.level, config.log.format)
     for warning in config.warnings:
         log_lines.write(logging.WARNING, "config_warning", warning=str(warning))
-    yield_interpreter()
+    lengthen_switch_interval()
     allow_open_files(config, file)
     signals = control or Signals(
         reload="always" if file else "with a terminal" if load else "never"
@@ -130,8 +129,7 @@ def serve(
     except OSError as error:
         fail(file_error_text(error))
     except UnknownAdapter as error:
-        click.echo(f"{named}: {error}", err=True)
-        sys.exit(ExitCode.WRONG)
+        fail(f"{file}: {error}", ExitCode.WRONG)
     with ExitStack() as parts:
         parts.callback(manager.close)
         parts.callback(appliance.stop)
@@ -140,7 +138,7 @@ def serve(
             parts.callback(reloading.close)
         if reloading is not None and file is not None:
             parts.callback(_control(appliance, reloading, file))
-        spare_what_stays()
+        freeze_garbage_collector()
         announce(greeting(appliance))
         manager.ready()
         while not signals.received:
@@ -171,7 +169,7 @@ def _control(appliance: Appliance, reloading: Reloader, file: Path) -> Callable[
 def _greeting(appliance: Appliance, file: Path) -> str:
     endpoints, config = appliance.endpoints(), appliance.config
     devices, nats = list(config.devices.items()), config.nats
-    shown = devices[:MAX_DEVICES]
+    shown = devices[:MAX_DEVICES_SHOWN]
     names = [*(endpoint.name for endpoint in endpoints), *(name for name, _ in shown)]
     names += [*config.links, *config.outputs, *([] if nats is None else ["nats"])]
     width = max(map(len, names), default=0)

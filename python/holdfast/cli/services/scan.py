@@ -61,7 +61,7 @@ from holdfast.net.nats.connection import Ping, Servers
 from holdfast.net.nats.pings import PING_INTERVAL_S, PINGS_OUTSTANDING
 from holdfast.net.nats_server import HOST, ServerUnusable, TemporaryServer
 from holdfast.runtime.bounded_files import FileWork
-from holdfast.runtime.interpreter import spare_what_stays
+from holdfast.runtime.interpreter import freeze_garbage_collector
 from holdfast.runtime.standstill import WallClock
 from holdfast.scanner.fleet.agreement import FleetRefused
 from holdfast.scanner.jetstream.entry_subscriptions import BUCKET
@@ -240,7 +240,7 @@ def _embedded_port(servers: Servers) -> int:
 async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
     signals = Signals(reload="with a terminal")
     log_lines.write(logging.INFO, "started", version=__version__)
-    spare_what_stays()
+    freeze_garbage_collector()
     former: Iterable[SubscribeRequest] | None = ()
     while former is not None:
         former = await _scan(settings, check, signals, former)
