@@ -6,10 +6,9 @@ import * as pageUrl from "./page_url.js";
 import { Discovery } from "./discovery.js";
 import { Values } from "./values.js";
 
-const may = { write: null, ask: inquire };
+const gateway = { allowsWrites: null, refresh: loadGatewaySettings };
 /** Errors of the probe after which other areas may still respond. */
 const UNPROVEN = new Set(["timeout", "connection_lost", "invalid_reply", "exception"]);
-const PROBE = "It can't read holding register 0, but other areas may work";
 const isSecure = () => $("transport").value === "tls";
 
 /** The device that the form names. */
@@ -23,8 +22,8 @@ const target = () => ({
 });
 
 const choose = tabs(document.querySelector("[role=tablist]"));
-const values = new Values(may);
-const map = new Discovery((area, address, length) => {
+const values = new Values(gateway);
+const discovery = new Discovery((area, address, length) => {
   choose($("tab-values"));
   $("read").focus();
   values.open(area, address, length);
@@ -35,9 +34,9 @@ let device = null;
 let connecting = null;
 
 /** Gets the settings of the gateway. */
-async function inquire() {
+async function loadGatewaySettings() {
   const status = await get("/api/gateway");
-  may.write = status.writes;
+  gateway.allowsWrites = status.writes;
   values.permit();
   const mode = $("mode");
   mode.textContent = status.writes ? "reads and writes" : "reads only";
@@ -48,10 +47,10 @@ async function inquire() {
   $("interval").min = status.limits.interval;
 }
 
-/** Gets the settings of the gateway, and connects if the link watches. */
+/** Gets the settings of the gateway, and connects if the page's URL has `watch=1`. */
 async function begin() {
   try {
-    await inquire();
+    await loadGatewaySettings();
   } catch (error) {
     say($("connection"), notice(error));
   }
@@ -64,7 +63,7 @@ function remember() {
   pageUrl.putDevice((id) => (id === "server" && !target().serverName ? null : $(id).value.trim()));
 }
 
-function recall() {
+function fillDeviceForm() {
   for (const [id, value] of pageUrl.view().device) $(id).value = value;
   $("server-label").hidden = !isSecure();
 }
@@ -77,20 +76,20 @@ function chooseTransport() {
 }
 
 async function connect() {
-  leave();
+  disconnect();
   remember();
   const asked = target();
   const aborting = new AbortController();
   connecting = aborting;
   say($("connection"), "Connecting…");
   try {
-    await inquire();
+    await loadGatewaySettings();
     const began = performance.now();
     const found = await post("/api/modbus/connect", asked, aborting.signal);
     if (connecting !== aborting) return;
     const took = Math.round(performance.now() - began);
-    if (found.exception) use(asked, `The device responded in ${took} ms. ${PROBE}: ${found.exception}.`);
-    else use(asked, `The device responded in ${took} ms.`);
+    if (found.exception) selectDevice(asked, `The device responded in ${took} ms, but can't read holding register 0: ${found.exception}. Other areas may work.`);
+    else selectDevice(asked, `The device responded in ${took} ms.`);
   } catch (error) {
     if (connecting !== aborting) return;
     connecting = null;
@@ -104,36 +103,36 @@ const offer = (asked) =>
     h("button", {
       type: "button",
       onclick: () => {
-        use(asked, `${PROBE}.`, false);
+        selectDevice(asked, "Holding register 0 was not read, but other areas may work.", false);
         $("tab-values").focus();
       },
     }, "Continue anyway"));
 
 /** Selects a device for the views. */
-function use(asked, what, proven = true) {
+function selectDevice(asked, what, proven = true) {
   device = asked;
   connecting = null;
   say($("connection"), h("p", {}, h("span", { class: proven ? "dot" : "dot unproven" }), what));
   $("work").disabled = $("work").hidden = false;
   values.use(device);
-  map.use(device);
+  discovery.use(device);
   if (proven) identify();
 }
 
 /** Disconnects: nothing is read or written until the next connect. */
-function leave() {
+function disconnect() {
   connecting?.abort();
   connecting = device = null;
   $("work").disabled = true;
   $("identity").hidden = true;
   values.leave();
-  map.leave();
+  discovery.leave();
 }
 
 /** Handles a change of the form: it may now name another device. */
 function changed() {
   const was = device ?? connecting;
-  leave();
+  disconnect();
   $("connection").querySelector(".offer")?.remove();
   const below = $("work").hidden ? "" : " The values below are stale.";
   if (was) say($("connection"), `Not connected: connect to continue.${below}`);
@@ -142,13 +141,13 @@ function changed() {
 /** Shows the device identification. Many devices do not support it. */
 async function identify() {
   const asked = device;
-  const facts = await told(asked).catch(() => []);
+  const facts = await identification(asked).catch(() => []);
   if (asked !== device || facts.length === 0) return;
   $("identity").replaceChildren(...facts.map(([name, text]) => h("div", {}, h("dt", {}, name), h("dd", {}, text))));
   $("identity").hidden = false;
 }
 
-async function told(asked) {
+async function identification(asked) {
   const found = await post("/api/modbus/identify", asked);
   const names = {
     vendorName: "Vendor", productName: "Product", productCode: "Code", modelName: "Model",
@@ -176,5 +175,5 @@ document.querySelector(".skip").addEventListener("click", (event) => {
 // Another link was opened in this tab. The page's own changes of its URL cause no such event.
 addEventListener("hashchange", () => location.reload());
 
-recall();
+fillDeviceForm();
 begin();

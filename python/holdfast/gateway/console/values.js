@@ -29,10 +29,10 @@ const MAX_PARTS_SIZE = 63 * 1024;
 /** How long the first poll of a tag list may take, in milliseconds. */
 const LONG = 60_000;
 
-/** The values view. `may.write` is whether the gateway allows writes; `null` until `may.ask()` has found out. */
+/** The values view. `gateway.allowsWrites` is `null` until `gateway.refresh()` has found out. */
 export class Values {
-  constructor(may) {
-    this.may = may;
+  constructor(gateway) {
+    this.gateway = gateway;
     this.writer = new Writer();
     this.lists = new Lists((part) => this.pin(part));
     this.pinned = [];
@@ -274,8 +274,8 @@ export class Values {
 
   /** Offers writes if the gateway allows them now. Nothing else of the tables changes, nor do the plots. */
   permit() {
-    this.panels.forEach((panel) => panel.permit(this.may.write === true));
-    $("only-reads").hidden = this.may.write !== false;
+    this.panels.forEach((panel) => panel.permit(this.gateway.allowsWrites === true));
+    $("only-reads").hidden = this.gateway.allowsWrites !== false;
   }
 
   panel(whole, tags) {
@@ -296,7 +296,7 @@ export class Values {
     const outcome = await this.writer.ask(panel.target(cell));
     if (outcome === null) return;
     // A reload of the gateway may have taken the right to write.
-    if (outcome === "refused") await this.may.ask().catch(() => {});
+    if (outcome === "refused") await this.gateway.refresh().catch(() => {});
     const told = WRITTEN[outcome];
     const { device } = panel.part;
     const isShown = () => this.panels.includes(panel) && this.device === device;
@@ -357,7 +357,7 @@ export class Values {
       const describe = !this.polls || wanted.some((part) => part.source?.profile);
       const more = { interval: this.interval, maxStreams: MAX_STREAMS.watch, describe };
       try {
-        if (told !== null) await this.may.ask();
+        if (told !== null) await this.gateway.refresh();
         await this.stream(wanted, more, stopping.signal, (name, data) => {
           if (this.watching !== stopping) return;
           if (name === "view") {
