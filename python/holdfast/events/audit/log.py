@@ -39,6 +39,7 @@ class Group:
     def __init__(self) -> None:
         self.bodies: list[bytes] = []
         self.is_refused = False
+        """Set by the first `write_group` for all that share the group."""
 
 
 class Audit:
@@ -64,7 +65,9 @@ class Audit:
         self._copies = copies
         self._lock = threading.Lock()
         self._end = End() if self._file is None else self._file.end
-        self._lines = self._failed = self._missing = 0
+        self._written = self._lost = 0
+        self._lost_unreported = 0
+        """Lost lines that no line of the file reports yet."""
         self._waiting: list[Record] = []
         self._group = Group()
         self._failing = self._is_closed = False
@@ -136,9 +139,13 @@ class Audit:
                 raise Unrecorded
 
     def retry(self) -> None:
-        """Writes lines that wait, and the number of lines that are missing, 0 if none is."""
+        """Tries to write waiting lines, and the number of lost lines.
+
+        Does nothing if the log is complete. If it fails and nothing waits, the number tests the
+        file, even if it is 0.
+        """
         with self._lock:
-            if self._waiting or self._missing or self._failing:
+            if self._waiting or self._lost_unreported or self._failing:
                 self._store([])
 
     def rotate(self) -> None:
@@ -158,7 +165,7 @@ class Audit:
                 if puts_aside and not self._file.is_empty:
                     self._file.rotate()
             except OSError:
-                self._fail()
+                self._note_failure()
 
     @property
     def failing(self) -> bool:
@@ -175,8 +182,8 @@ class Audit:
         """Returns the numbers of lines written, failed and waiting, and those of the copies."""
         with self._lock:
             return {
-                "lines": self._lines,
-                "failed": self._failed,
+                "lines": self._written,
+                "failed": self._lost,
                 "waiting": len(self._waiting),
                 "failing": self._failing,
                 "copies": {each.name: each.counts() for each in self._copies},
@@ -185,7 +192,7 @@ class Audit:
     def close(self) -> None:
         """Writes what waits, and closes file and copies. Later lines are lost."""
         with self._lock:
-            if self._waiting or self._missing:
+            if self._waiting or self._lost_unreported:
                 self._store([])
             self._lose(self._waiting)
             self._waiting, self._is_closed = [], True
@@ -208,22 +215,22 @@ class Audit:
             try:
                 self._file.check()
             except OSError:
-                self._fail()
+                self._note_failure()
                 return 0
             if self._file.broken is not None:
                 reports.append({"event": BREAK, **self._file.broken})
         # Without a line to write, nothing shows whether the file can be written again.
         is_probe = self._failing and not records and not self._waiting
-        if self._missing or is_probe:
-            reports.append({"lost": self._missing})
+        if self._lost_unreported or is_probe:
+            reports.append({"lost": self._lost_unreported})
         before = [*(self._records(reports) if reports else ()), *self._waiting]
         written = self._append([*before, *records] if before else records, together=together)
         if written >= len(reports):
-            self._missing = 0
+            self._lost_unreported = 0
             if self._file is not None:
                 self._file.broken = None
             self._waiting = self._waiting[written - len(reports) :]
-        self._lines += max(0, written - len(reports))
+        self._written += max(0, written - len(reports))
         return max(0, written - len(before))
 
     def _append(self, records: list[Record], *, together: bool) -> int:
@@ -237,7 +244,7 @@ class Audit:
                 for count in self._file.append(lines, together=together):
                     written += count
             except OSError:
-                self._fail()
+                self._note_failure()
             else:
                 self._set_failing(False)
         if written:
@@ -251,12 +258,12 @@ class Audit:
 
     def _lose(self, records: Sequence[Record]) -> None:
         """Counts lines that the file lacks. Their copies have no place in the chain."""
-        self._failed += len(records)
-        self._missing += len(records)
+        self._lost += len(records)
+        self._lost_unreported += len(records)
         self._send([unchained(record) for record in records])
 
-    def _fail(self) -> None:
-        """Logs the current exception."""
+    def _note_failure(self) -> None:
+        """Logs the current exception, and marks the log as failing."""
         assert self._file is not None
         log_lines.problem("audit_failed", file=str(self._file.file))
         self._set_failing(True)
@@ -265,5 +272,5 @@ class Audit:
         if failing != self._failing:
             self._failing = failing
             if not failing:
-                log_lines.write(logging.INFO, "audit_back", lost=self._missing)
+                log_lines.write(logging.INFO, "audit_back", lost=self._lost_unreported)
             self._on_failing(failing)
