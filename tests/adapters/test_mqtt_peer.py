@@ -14,7 +14,7 @@ import pytest
 from holdfast.adapters.mqtt import adapter, answers, connection, inbox, sessions
 from holdfast.ingest import MemoryAccess
 from holdfast.net.mqtt import client, connect
-from holdfast.net.mqtt.stream import BrokerSocket
+from holdfast.net.mqtt.broker_socket import BrokerSocket
 from support import mqtt_peer as mqtt
 from support import wire
 from support.mqtt_peer import FakeBroker, publish

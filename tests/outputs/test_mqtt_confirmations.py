@@ -13,8 +13,8 @@ import msgspec
 import pytest
 
 from holdfast.config.models.outputs import MqttOutputConfig
+from holdfast.net.mqtt.packet_splitter import PacketSplitter
 from holdfast.net.mqtt.packets import parse_publish
-from holdfast.net.mqtt.stream import Packets
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt import MqttOutput, session
 from holdfast.runtime.stop import Stop
@@ -58,7 +58,7 @@ class Broker:
                         pass
 
     def _serve(self, connection: socket.socket, most: int) -> None:
-        packets, confirmed = Packets(LARGEST, LARGEST), 0
+        packets, confirmed = PacketSplitter(LARGEST, LARGEST), 0
         seen: list[Any] = []
         self.seen.append(seen)
         while data := connection.recv(65536):

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.config.values.mqtt_output_topics import TopicNames
+from holdfast.net.mqtt.broker_socket import BrokerSocket
+from holdfast.net.mqtt.packet_splitter import PacketSplitter
 from holdfast.net.mqtt.packets import parse_publish
 from holdfast.net.mqtt.selector import Waiter
-from holdfast.net.mqtt.stream import BrokerSocket, Packets
 from holdfast.outputs.mqtt.delivery import Delivery, Message, packed, packed_topic
 from holdfast.runtime.stop import Stop
 from support.config_folder import Folder
@@ -33,7 +34,7 @@ def message(payload: bytes = b"1", *, retain: bool = False) -> Message:
 def test_what_is_sent_is_what_is_parsed(size: int, five: bool) -> None:
     sent = [message(bytes([at]) * size, retain=at == 1) for at in range(3)]
     data = packed(sent, [7, 8, 9], qos=1, five=five)
-    found = list(Packets(LARGEST, LARGEST).feed(data))
+    found = list(PacketSplitter(LARGEST, LARGEST).feed(data))
     assert [first & 1 for first, _, _ in found] == [0, 1, 0]
     parsed = [parse_publish(first, body, size, five=five) for first, body, size in found]
     assert [each.identifier for each in parsed] == [7, 8, 9]
@@ -45,8 +46,8 @@ def test_packets_are_found_in_pieces_of_any_size() -> None:
     chance = random.Random(7)
     sent = [message(bytes(chance.randrange(300))) for _ in range(50)]
     data = packed(sent, range(1, 51), qos=1, five=True)
-    whole = list(Packets(LARGEST, LARGEST).feed(data))
-    packets, found = Packets(LARGEST, LARGEST), []
+    whole = list(PacketSplitter(LARGEST, LARGEST).feed(data))
+    packets, found = PacketSplitter(LARGEST, LARGEST), []
     while data:
         size = chance.randrange(1, 40)
         found += list(packets.feed(data[:size]))
@@ -56,14 +57,14 @@ def test_packets_are_found_in_pieces_of_any_size() -> None:
 
 @pytest.mark.parametrize("piece", [1, 7, 1000, 2**20])
 def test_a_packet_that_is_too_large_can_be_cut(piece: int) -> None:
-    packets = Packets(1000, kept=100)
+    packets = PacketSplitter(1000, kept_bytes=100)
     large, small = message(bytes(range(256)) * 8), message(b"next")
     data = packed([small, large, large, small], range(1, 5), qos=1, five=True)
     found = []
     for at in range(0, len(data), piece):
         found += [(bytes(body), size) for _, body, size in packets.feed(data[at : at + piece])]
         assert len(packets._left) + len(packets._body) <= 1000
-    whole = [body for _, body, _ in Packets(LARGEST, LARGEST).feed(data)]
+    whole = [body for _, body, _ in PacketSplitter(LARGEST, LARGEST).feed(data)]
     cut = [whole[0], whole[1][:100], whole[2][:100], whole[3]]
     assert found == [(body, len(full)) for body, full in zip(cut, whole, strict=True)]
 
@@ -76,7 +77,7 @@ def test_packets_keep_their_order_while_the_broker_takes_little() -> None:
         broker = BrokerSocket(mine)
         sent = [bytes([number]) * 3000 for number in range(100)]
         for number, packet in enumerate(sent):
-            assert (broker.send if number % 2 else broker.put)(packet) in (None, 3000)
+            assert (broker.send if number % 2 else broker.send_to_broker)(packet) in (None, 3000)
         assert broker.unsent > 10
         got = b""
         while len(got) < 300_000:
@@ -88,7 +89,7 @@ def test_packets_keep_their_order_while_the_broker_takes_little() -> None:
 
 def test_a_length_of_five_bytes_is_malformed() -> None:
     with pytest.raises(ValueError, match="more than 4 bytes"):
-        list(Packets(LARGEST, LARGEST).feed(b"\x30\xff\xff\xff\xff\x01"))
+        list(PacketSplitter(LARGEST, LARGEST).feed(b"\x30\xff\xff\xff\xff\x01"))
 
 
 def test_confirmations_count_without_a_gap() -> None:

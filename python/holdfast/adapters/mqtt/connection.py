@@ -18,8 +18,8 @@ from holdfast.adapters.mqtt.inbox import MAX_PAYLOAD_BYTES
 from holdfast.adapters.mqtt.sessions import SESSION_EXPIRY_S
 from holdfast.ingest import REFUSED_FOR_NOW
 from holdfast.net.mqtt.client import BrokerClient
+from holdfast.net.mqtt.packet_splitter import PacketSplitter
 from holdfast.net.mqtt.packets import MAX_HEAD_BYTES, acknowledgement, parse_publish
-from holdfast.net.mqtt.stream import Packets
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -64,7 +64,7 @@ class BrokerConnection(BrokerClient):
         self._largest_sent: int | None = None
         self.most_qos = 1
         """The highest quality of service that the broker accepts, at most 1."""
-        self._packets = Packets(MAX_PAYLOAD_BYTES + MAX_HEAD_BYTES, MAX_HEAD_BYTES)
+        self._packets = PacketSplitter(MAX_PAYLOAD_BYTES + MAX_HEAD_BYTES, MAX_HEAD_BYTES)
         self._alive_at = time.monotonic()
         self._arrived: Iterator[tuple[int, bytes | bytearray, int]] = iter(())
         """What was read and is not handled yet."""
@@ -128,7 +128,7 @@ class BrokerConnection(BrokerClient):
     def read_more(self) -> None:
         """Reads and handles what has arrived, while the broker takes the answers."""
         if not self._is_late:
-            data = self.connection.read(_READ_BYTES)
+            data = self.connection.receive_from_broker(_READ_BYTES)
             self._arrived = self._packets.feed(data)
             if data:
                 self._note_alive()
@@ -172,10 +172,10 @@ class BrokerConnection(BrokerClient):
         # Before the answer: if the broker closes the connection because of that, it does not
         # deliver the message again.
         if message.qos == 1:
-            self.connection.put(acknowledgement(_PUBACK, message.identifier))
+            self.connection.send_to_broker(acknowledgement(_PUBACK, message.identifier))
         elif message.qos == 2:
             self._unreleased.add(message.identifier)
-            self.connection.put(acknowledgement(_PUBREC, message.identifier))
+            self.connection.send_to_broker(acknowledgement(_PUBREC, message.identifier))
         if not is_known and self.connection.failure is None:
             self._answer(self, message, result)
 
@@ -185,7 +185,7 @@ class BrokerConnection(BrokerClient):
             raise ValueError("a PUBREL packet without identifier")
         identifier = int.from_bytes(body[:2])
         self._unreleased.discard(identifier)
-        self.connection.put(acknowledgement(_PUBCOMP, identifier))
+        self.connection.send_to_broker(acknowledgement(_PUBCOMP, identifier))
 
 
 def _staleness(message: Publish) -> str | None:

@@ -1,83 +1,27 @@
-"""The packets between a client and a broker, without keeping a large one in memory."""
+"""The connection to a broker, as paho sees it."""
 
 from __future__ import annotations
 
 from collections import deque
 from typing import TYPE_CHECKING
 
-from holdfast.net.mqtt.packets import variable_integer
-
 if TYPE_CHECKING:
     import socket
-    from collections.abc import Iterator
 
     from holdfast.net.secure_channel import SecureChannel
 
 
-class Packets:
-    """Packets from pieces of a byte stream."""
-
-    def __init__(self, most: int, kept: int) -> None:
-        """Of a packet with more than `most` bytes, `kept` are kept."""
-        self._most, self._kept = most, kept
-        self._left = b""
-        """The beginning of a packet, before its body."""
-        self._first = self._size = self._missing = 0
-        """Of a packet whose body is not complete: first byte, size, and bytes to come."""
-        self._body = bytearray()
-
-    def feed(self, data: bytes) -> Iterator[tuple[int, bytes | bytearray, int]]:
-        """Yields the first byte, the body and the uncut size of each packet that is complete.
-
-        Take all of them before the next call. Raises `ValueError`.
-        """
-        if self._missing:
-            rest = self._missing
-            self._add(data[:rest])
-            yield from self._completed()
-            data = data[rest:]
-        data = self._left + data
-        at, end, most = 0, len(data), self._most
-        while end - at >= 2:
-            size, start = data[at + 1], at + 2
-            if size > 127:
-                long = variable_integer(data, at + 1)
-                if long is None:
-                    break
-                size, start = long
-            finish = start + size
-            if finish > end or size > most:
-                self._first, self._size, self._missing = data[at], size, size
-                self._add(data[start:finish])
-                yield from self._completed()
-            else:
-                yield data[at], data[start:finish], size
-            at = finish
-        self._left = data[at:]
-
-    def _add(self, part: bytes) -> None:
-        limit = self._size if self._size <= self._most else self._kept
-        self._body += part[: limit - len(self._body)]
-        self._missing -= len(part)
-
-    def _completed(self) -> Iterator[tuple[int, bytearray, int]]:
-        if self._missing:
-            return
-        body, self._body = self._body, bytearray()
-        yield self._first, body, self._size
-
-
 class BrokerSocket:
-    """What paho takes for its socket: it receives the packets that are put into `for_paho`.
+    """The socket that paho uses: paho receives only the packets that are put into `paho_buffer`.
 
-    Packets that can't be sent at once wait in it, those of paho and those of `put` in their order.
+    Packets that can't be sent at once wait here, those of paho and of `send_to_broker` in order.
     """
 
     def __init__(self, connection: socket.socket, channel: SecureChannel | None = None) -> None:
         """`connection` does not block. With a `channel`, it carries TLS."""
         self.connection = connection
         self._channel = channel
-        self.for_paho = bytearray()
+        self.paho_buffer = bytearray()
         self.failure: Exception | None = None
         """Why the connection has ended: an `OSError`, or an `EOFError` if the broker closed it."""
         self.is_open = True
@@ -88,8 +32,8 @@ class BrokerSocket:
         """The number of packets, or of batches of them, that wait."""
         return len(self._unsent)
 
-    def read(self, size: int) -> bytes:
-        """Returns what has arrived; nothing if that is nothing, or the connection has ended."""
+    def receive_from_broker(self, size: int) -> bytes:
+        """Returns the bytes that have arrived: none also if the connection has ended, `failure`."""
         try:
             data = self.connection.recv(size)
             if not data:
@@ -119,7 +63,7 @@ class BrokerSocket:
         if self._channel is not None:
             self._send(self._channel.outgoing())
 
-    def put(self, packets: bytes) -> None:
+    def send_to_broker(self, packets: bytes) -> None:
         """Sends packets, now or when the broker takes more."""
         self._send(packets if self._channel is None else self._channel.encrypted(packets))
 
@@ -147,10 +91,10 @@ class BrokerSocket:
     # What paho calls.
 
     def recv(self, buffer_size: int) -> bytes:
-        """Returns a part of `for_paho`, and then tells how the connection ended."""
-        if self.for_paho:
-            data = bytes(self.for_paho[:buffer_size])
-            del self.for_paho[:buffer_size]
+        """Returns a part of `paho_buffer`, and then tells how the connection ended."""
+        if self.paho_buffer:
+            data = bytes(self.paho_buffer[:buffer_size])
+            del self.paho_buffer[:buffer_size]
             return data
         if isinstance(self.failure, OSError):
             raise self.failure
@@ -160,7 +104,7 @@ class BrokerSocket:
 
     def send(self, buffer: bytes | bytearray) -> int:
         """Takes a packet."""
-        self.put(bytes(buffer))
+        self.send_to_broker(bytes(buffer))
         if isinstance(self.failure, OSError):
             raise self.failure
         return len(buffer)

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from paho.mqtt.client import ConnectFlags
     from paho.mqtt.reasoncodes import ReasonCode
 
+    from holdfast.net.mqtt.broker_socket import BrokerSocket
     from holdfast.net.mqtt.selector import Waiter
-    from holdfast.net.mqtt.stream import BrokerSocket
     from holdfast.net.tls import Tls
 
 
@@ -131,7 +131,7 @@ class BrokerClient(Client):
 
     def pass_on(self, first: int, body: bytes | bytearray) -> MQTTErrorCode:
         """Passes a packet to paho, which closes the connection after an error."""
-        self.connection.for_paho += head(first, len(body)) + body
+        self.connection.paho_buffer += head(first, len(body)) + body
         return self.notice()
 
     def notice(self) -> MQTTErrorCode:

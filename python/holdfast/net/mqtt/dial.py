@@ -8,7 +8,7 @@ import time
 from concurrent.futures import wait
 from typing import TYPE_CHECKING, Any
 
-from holdfast.net.mqtt.stream import BrokerSocket
+from holdfast.net.mqtt.broker_socket import BrokerSocket
 from holdfast.net.resolver import CONFIGURED
 from holdfast.net.secure_channel import SecureChannel
 from holdfast.runtime.text import error_text
@@ -81,7 +81,7 @@ def _agree(broker: BrokerSocket, channel: SecureChannel, waiter: Waiter, deadlin
     while not channel.is_ready:
         _wait(broker.connection, waiter, deadline, read=True, write=broker.unsent > 0)
         broker.flush()
-        if broker.read(READ_BYTES):
+        if broker.receive_from_broker(READ_BYTES):
             raise ConnectionError("the broker sent something before it was asked")
         if isinstance(broker.failure, OSError):
             raise broker.failure

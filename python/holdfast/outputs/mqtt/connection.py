@@ -24,8 +24,8 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
 from holdfast.net.mqtt.client import BrokerClient
+from holdfast.net.mqtt.packet_splitter import PacketSplitter
 from holdfast.net.mqtt.packets import MAX_HEAD_BYTES, acknowledgement, parse_publish
-from holdfast.net.mqtt.stream import Packets
 from holdfast.outputs.mqtt.delivery import MAX_IN_FLIGHT, Message, packed, size_of
 from holdfast.outputs.mqtt.late_commands import PING_INTERVAL_S, Pings
 
@@ -86,7 +86,7 @@ class Connection(BrokerClient):
         self._max_in_flight = MAX_IN_FLIGHT[settings.version]
         self._largest: int | None = None
         self._retains = True
-        self._packets = Packets(MAX_PAYLOAD_BYTES + MAX_HEAD_BYTES, MAX_HEAD_BYTES)
+        self._packets = PacketSplitter(MAX_PAYLOAD_BYTES + MAX_HEAD_BYTES, MAX_HEAD_BYTES)
         self._subscribing: dict[int, Sequence[str]] = {}
         self.on_subscribe = self._on_subscribed
         self._waiting: deque[Delivery] = deque()
@@ -180,7 +180,7 @@ class Connection(BrokerClient):
         if self._proves:
             self._pinged, self._written = self._written, []
         self._pings.sent()
-        self.connection.put(_PING)
+        self.connection.send_to_broker(_PING)
 
     @staticmethod
     def _confirm(deliveries: list[Delivery]) -> bool:
@@ -216,7 +216,7 @@ class Connection(BrokerClient):
             self._written.append(delivery)
         if some:
             data = packed(some, identifiers, qos=self._qos, five=self._five)
-            self.connection.put(data)
+            self.connection.send_to_broker(data)
         return bool(large)
 
     def _fits(self, message: Message) -> bool:
@@ -232,7 +232,7 @@ class Connection(BrokerClient):
     def read_more(self) -> bool:
         """Reads what has arrived. Returns whether some deliveries are done."""
         connection = self.connection
-        data = connection.read(READ_BYTES)
+        data = connection.receive_from_broker(READ_BYTES)
         if connection.failure is not None:
             is_closed = isinstance(connection.failure, EOFError)
             lost = "" if is_closed else "the connection was lost: "
@@ -283,7 +283,7 @@ class Connection(BrokerClient):
         if self._writes:
             message = message._replace(lateness=self._pings.lateness())
         if message.qos == 1:
-            self.connection.put(acknowledgement(PUBACK, message.identifier))
+            self.connection.send_to_broker(acknowledgement(PUBACK, message.identifier))
         elif message.qos == 2:
             raise ValueError("a message with a quality of service that was not requested")
         self._on_command(message)
