@@ -119,18 +119,18 @@ class ReportHost(ReportHandlers, Protocol):
 
 
 class Placement:
-    """That of a scanner without a fleet, which keeps nothing. Others override what differs."""
+    """Polls all devices, and stores no subscriptions. Subclasses override what differs."""
 
     fleet_name: str | None = None
-    queue = ""
-    """The queue group of subjects of which only one node gets each message; empty without one."""
-    shared: Sequence[str] = ()
-    """These subjects."""
+    queue_group = ""
+    """The NATS queue group of `shared_subjects`; empty without a fleet."""
+    shared_subjects: Sequence[str] = ()
+    """The subjects of which only one node of the fleet gets each message."""
 
     def outbox(self, _repeat_values: Callable[[], None], /) -> Outbox:
-        """Returns the queue of messages. It calls `repeat_values` when it had to drop some.
+        """Returns the queue of messages, which keeps the newest of each tag while NATS is away.
 
-        It keeps the newest message of each tag while NATS is away.
+        That of a fleet drops messages if it must, and calls `repeat_values` then.
         """
         return Outbox()
 
@@ -175,7 +175,7 @@ class Placement:
         return None
 
     def lease(self, _device: ScannedDevice, /) -> int | None:
-        """Returns the number for the header of messages about a device; `None` without a fleet."""
+        """Returns the number of the lease, for the header of messages; `None` without a fleet."""
         return None
 
     async def store(

@@ -133,8 +133,8 @@ class Scanner:
             self._handlers(dialect),
             self._connected,
             settings.ping,
-            shared=self._placement.shared,
-            queue=self._placement.queue,
+            shared=self._placement.shared_subjects,
+            queue=self._placement.queue_group,
             max_pause_s=settings.max_pause_s,
         )
 

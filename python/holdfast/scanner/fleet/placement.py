@@ -52,9 +52,9 @@ class FleetPlacement(FleetMember):
         self._settings = settings
         self._prefix = settings.prefix
         self.fleet_name = fleet.name
-        self.queue = f"holdfast-{fleet.name}"
+        self.queue_group = f"holdfast-{fleet.name}"
         names = ("subscribe", "unsubscribe", "command.>", "browse", "variables")
-        self.shared = [f"{settings.prefix}.{name}" for name in names]
+        self.shared_subjects = [f"{settings.prefix}.{name}" for name in names]
         self._counts: Callable[[], Mapping[str, int]] = dict
         """What this node has done, from `reports` on."""
         terms = Terms.of(settings, fleet)

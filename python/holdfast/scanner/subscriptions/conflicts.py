@@ -1,7 +1,7 @@
 """What a request may not change, because other subscribers or devices use it.
 
 A device has one address and one set of settings, a tag has one definition, and devices on one line
-or at one address share their settings. Who is the only one to use something may change it.
+or at one address share their settings. A subscriber may change what nobody else uses.
 """
 
 from __future__ import annotations
@@ -37,10 +37,8 @@ def replaces(device: ScannedDevice, subscription: Subscription) -> bool:
         for key in SETTINGS:
             known_value, requested_value = getattr(known, key), getattr(requested, key)
             if key in subscription.given_settings and known_value != requested_value:
-                conflict = (
-                    f"{key} of {device.id} is already different: "
-                    f"{known_value}, not {requested_value}"
-                )
+                found = f"is {known_value} for other subscribers, not {requested_value}"
+                conflict = f"{key} of {device.id} {found}"
                 break
     if not conflict:
         return False
@@ -86,12 +84,13 @@ def check_subject(id: str, owners: Mapping[str, str]) -> None:
 
 
 def check_settings(target: Target, other: ScannedDevice) -> None:
-    """Raises `Refused` if a target has not the settings of a device on the same connection."""
+    """Raises `Refused` if a target and a device on the same connection differ in settings."""
     settings, shared = shared_options(target), other.source.target
     names = [each.device for each in (target, shared) if isinstance(each, SerialTarget)]
     if len(set(names)) > 1:
         # The poller would open the line once for each name, and only the first can have it.
-        raise Refused(f"{names[0]} is the serial line {names[1]} of {other.id}: use that name")
+        message = f"{names[0]} and {names[1]} are one serial line"
+        raise Refused(f"{message}, and {other.id} uses {names[1]}: use {names[1]}")
     for key, known in shared_options(shared).items():
         if known != settings[key]:
             at = "on one serial line" if isinstance(target, SerialTarget) else "at one address"
@@ -127,5 +126,5 @@ def _described(source: Source) -> str:
     return f"{target}{more} unit {source.unit}"
 
 
-def _setting_text(setting: object) -> object:
-    return "the default" if setting is None else setting
+def _setting_text(setting: object) -> str:
+    return "the default" if setting is None else str(setting)

@@ -79,9 +79,9 @@ DEFAULT_PLAN = Plan()
 def _ranges(where: str, ranges: Iterable[Range]) -> Iterable[tuple[Area, int, int]]:
     for index, given in enumerate(ranges):
         *area, start, end = given
-        addresses = isinstance(start, int) and isinstance(end, int) and start <= end
-        if not addresses or any(word not in AREA_OF_CODE for word in area):
-            allowed = "allowed: first and last address, with an optional area before them"
+        is_range = isinstance(start, int) and isinstance(end, int) and start <= end
+        if not is_range or any(word not in AREA_OF_CODE for word in area):
+            allowed = "allowed: [area,] first, last, with first not above last"
             raise Refused(f"{where}[{index}] is {given}, {allowed}")
         assert isinstance(start, int)
         assert isinstance(end, int)
