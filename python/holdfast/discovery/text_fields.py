@@ -19,23 +19,25 @@ MIN_TEXT_BYTES = 3
 MAX_TEXT_BYTES = 64
 """The least and the most bytes of text."""
 
-LENGTHS = {4: 4.5, 6: 4.5, 8: 2.7, 10: 4.0, 12: 3.7, 14: 5.0, 16: 2.7, 18: 5.0, 20: 3.3, 24: 4.0,
-           32: 2.3, 40: 4.5, 48: 5.5, 64: 4.5}  # fmt: skip
-OTHER_LENGTH = 6.0
-"""How rare the lengths of fields are in bytes, in bits."""
+# Bits are costs, minus log2 of a probability: more is rarer.
 
-FULL = 2.0
-"""How rare it is that a text fills its field: about one in six does."""
+LENGTH_BITS = {4: 4.5, 6: 4.5, 8: 2.7, 10: 4.0, 12: 3.7, 14: 5.0, 16: 2.7, 18: 5.0, 20: 3.3,
+               24: 4.0, 32: 2.3, 40: 4.5, 48: 5.5, 64: 4.5}  # fmt: skip
+OTHER_LENGTH_BITS = 6.0
+"""The bits of a field's length in bytes."""
+
+FULL_FIELD_BITS = 2.0
+"""A text that fills its field, without padding."""
 
 USUAL_TEXT_BYTES = 12
-LONG = 0.3
+BITS_PER_EXTRA_BYTE = 0.3
 """The bytes of usual texts, and the bits for each byte more."""
 
-SPACES = 3.0
-"""How rare padding with spaces is."""
+SPACE_PADDING_BITS = 3.0
+"""A field that is padded with spaces."""
 
-LONGER = 3.0
-"""How common it is that a field is longer than what was read of it, if text ends nowhere."""
+OPEN_END_BITS = 3.0
+"""A field that goes on behind what was read, if text ends nowhere."""
 
 STARTS = {"U": 0.8, "L": 2.5, "D": 2.0, "P": 5.0, "S": 5.0}
 FOLLOWS = {
@@ -50,15 +52,15 @@ punctuation, space.
 """
 
 WITHIN = {"U": 4.3, "L": 4.1, "D": 3.3, "S": 0.0}
-CODE = 3.0
-CODE_LETTER = 5.2
+CODE_BITS = 3.0
+CODE_LETTER_BITS = 5.2
 """Bits of a code, such as a serial number or a MAC address: of its kind, and of each of the 36
 capital letters and digits in any order.
 """
 
 USUAL_MARKS = b"-._/:"
-USUAL_MARK = 2.5
-MARK = 5.5
+USUAL_MARK_BITS = 2.5
+MARK_BITS = 5.5
 """Bits for a character of its class."""
 
 
@@ -79,46 +81,46 @@ def fields(contents: Sequence[bytes], *, is_open: bool) -> Iterator[Field]:
     `is_open` means that registers behind these bytes exist, which were not read.
     """
     data = contents[0]
-    letters = _letters(data)
-    if letters < MIN_TEXT_BYTES:  # Most registers are no text: this must be quick.
+    printable = _printable_length(data)
+    if printable < MIN_TEXT_BYTES:  # Most registers are no text: this must be quick.
         return
-    if any(_letters(each) < MIN_TEXT_BYTES for each in contents):
+    if any(_printable_length(each) < MIN_TEXT_BYTES for each in contents):
         return
     whole = min(_padded(each) for each in contents)
     if any(not each[:MIN_TEXT_BYTES].strip() for each in contents):
         return
-    text = data[:letters]
+    text = data[:printable]
     costs = _costs(text)
-    lengths = {*LENGTHS, letters + letters % 2, whole - whole % 2}
+    lengths = {*LENGTH_BITS, printable + printable % 2, whole - whole % 2}
     for length in sorted(lengths):
         if MIN_TEXT_BYTES <= length <= whole:
             yield Field(length, _bits(costs, text[:length], length))
     if is_open and all(map(_is_text, contents)) and len(data) < MAX_TEXT_BYTES:
-        yield Field(letters, costs[letters] + LONGER, goes_on=True)
+        yield Field(printable, costs[printable] + OPEN_END_BITS, goes_on=True)
 
 
 def _bits(costs: Sequence[float], text: bytes, length: int) -> float:
     """The bits of a text in a field of some length."""
-    letters = len(text.rstrip(b" "))
-    usual = LENGTHS.get(length, OTHER_LENGTH) + LONG * max(0, letters - USUAL_TEXT_BYTES)
-    if letters == length:
-        return costs[letters] + usual + FULL
-    spaces = SPACES if letters < len(text) else 0.0
-    return costs[letters] + usual + spaces + math.log2(length)
+    used = len(text.rstrip(b" "))
+    bits = costs[used] + LENGTH_BITS.get(length, OTHER_LENGTH_BITS)
+    bits += BITS_PER_EXTRA_BYTE * max(0, used - USUAL_TEXT_BYTES)
+    if used == length:
+        return bits + FULL_FIELD_BITS
+    return bits + (SPACE_PADDING_BITS if used < len(text) else 0.0) + math.log2(length)
 
 
-def _letters(data: bytes) -> int:
+def _printable_length(data: bytes) -> int:
     """The printable bytes at the beginning."""
     return next((at for at, byte in enumerate(data) if not 0x20 <= byte < 0x7F), len(data))
 
 
 def _is_text(data: bytes) -> bool:
-    return _letters(data) == len(data)
+    return _printable_length(data) == len(data)
 
 
 def _padded(data: bytes) -> int:
     """The printable bytes at the beginning, with the NULs behind them."""
-    at = _letters(data)
+    at = _printable_length(data)
     return at + next((n for n, byte in enumerate(data[at:]) if byte), len(data) - at)
 
 
@@ -126,13 +128,13 @@ def _costs(text: bytes) -> list[float]:
     """The bits of the first n characters, for each n: as words, or as a code."""
     costs = [0.0]
     words = 0.0
-    code = CODE
+    code = CODE_BITS
     before = ""
     for byte in text:
         own = _class(byte)
-        mark = USUAL_MARK if byte in USUAL_MARKS else MARK
+        mark = USUAL_MARK_BITS if byte in USUAL_MARKS else MARK_BITS
         words += (FOLLOWS[before + own] if before else STARTS[own]) + WITHIN.get(own, mark)
-        code += CODE_LETTER if own in "UD" else math.inf
+        code += CODE_LETTER_BITS if own in "UD" else math.inf
         costs.append(min(words, code))
         before = own
     return costs
