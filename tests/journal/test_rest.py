@@ -72,7 +72,7 @@ def test_a_write_whose_outcome_nobody_waited_for_is_recorded(
     memory_access = MemoryAccess("rest", {"plant": slow.memory}, audit)
 
     async def cancelled() -> None:
-        keeping = asyncio.create_task(memory_access.keep(begun))
+        keeping = asyncio.create_task(memory_access.finish_async(begun))
         await asyncio.sleep(0)  # It begins.
         keeping.cancel()
         await asyncio.gather(keeping, return_exceptions=True)
@@ -97,6 +97,6 @@ def test_a_range_that_a_reload_gives_to_a_device_meanwhile_goes_there(tmp_path: 
         memory_access = MemoryAccess("rest", {"plant": plant}, passages=passages)
         begun = memory_access.begin(body("plant", 7), GRANT, "127.0.0.1:50000")
         plant.mirror([("holding_registers", 0, 8)])
-        assert asyncio.run(memory_access.keep(begun)) is None
+        assert asyncio.run(memory_access.finish_async(begun)) is None
     assert begun.device == "drive"
     assert plant.read("holding_registers", 0, 1) == [0]

@@ -172,11 +172,11 @@ class MemoryAccess:
             code = self._to_device(begun, lambda passage, *write: passage.write(*write))
             return self.answered(begun, code)
 
-    async def keep(self, begun: Begun) -> Written | None:
-        """As `finish`, of memories that are kept, without occupying a thread. Raises `Refused`.
+    async def finish_async(self, begun: Begun) -> Written | None:
+        """As `finish`, for memories that a file or a log stores, without blocking a thread.
 
         Writes are carried out in the order in which they came, and also if nobody waits any more.
-        Returns `None` if a device must take the write.
+        Returns `None` if a device must take the write. Raises `Refused`.
         """
         import asyncio  # An appliance without REST has no event loop.
 

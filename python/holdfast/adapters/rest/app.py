@@ -57,7 +57,7 @@ class EndSession(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class App(Application):
-    """The application."""
+    """Routes operations of REST to memories, devices and diagnostics."""
 
     def __init__(
         self,
@@ -101,7 +101,7 @@ class App(Application):
         refused = error
         if isinstance(error, BadRequest):
             refused = Refused(error.reason, error.detail)
-            # Nobody can fill the audit log with writes that are refused before a token was checked.
+            # Without a valid token, a refusal is not audited: anyone could fill the audit log.
             write = request.who != "-" and (request.method, request.path) == ("POST", INGEST)
             note = self._memory_access.refuse if write else self._memory_access.note
             note(refused, request.who, request.peer)
@@ -112,7 +112,7 @@ class App(Application):
     def check_writer(self, request: Request) -> None:
         """Raises `BadRequest` for a client that may not write, if its body has not arrived yet.
 
-        Else it is refused with what it would have written, for the audit log.
+        Later, the memory access refuses it, with what it would have written for the audit log.
         """
         if request.whole is None:
             self.grants.check_writer(request.who)
@@ -131,11 +131,11 @@ class App(Application):
         if begun.device is not None:
             return _written(self._device_writes.carry_out(request, begun))
         if access.waits(begun):
-            return _written(self._keep(request, begun))
+            return _written(self._finish_async(request, begun))
         return lambda: response(JSON, _answer(access.finish(begun)))
 
-    async def _keep(self, request: Request, begun: Begun) -> Written:
-        written = await self._memory_access.keep(begun)
+    async def _finish_async(self, request: Request, begun: Begun) -> Written:
+        written = await self._memory_access.finish_async(begun)
         # Since it began, a reload may have given the range to a device.
         return written or await self._device_writes.carry_out(request, begun)
 
@@ -196,8 +196,8 @@ class App(Application):
         status = self._diagnostics.adapter("mqtt")
         if status is None:
             raise BadRequest("not_configured", "the configuration has no mqtt")
-        least: dict[str, object] = {"connected": False, "broker": None, "topics": []}
-        return json_response(least | status)
+        defaults: dict[str, object] = {"connected": False, "broker": None, "topics": []}
+        return json_response(defaults | status)
 
     def sessions(self, _: Request, __: Given) -> Response:
         """Lists the connections of listeners."""
