@@ -283,4 +283,4 @@ def test_subscriptions_are_optional_with_a_map(tmp_path: Path) -> None:
         "memories: {plant: {coils: 16}}\n"
         "mqtt: {url: 'mqtt://127.0.0.1', client_id: a, map: [" + ENTRY + "]}\n"
     )
-    assert Folder(tmp_path).config(text).mapped()["a"].memory == "plant"
+    assert Folder(tmp_path).config(text).mqtt_tags()["a"].memory == "plant"

@@ -19,7 +19,7 @@ import pytest
 
 import holdfast
 from holdfast import _core, raw_ingest
-from holdfast.appliance import Appliance
+from holdfast.appliance import Appliance, reload
 from holdfast.appliance.parts.mirrors import Mirrors
 from holdfast.appliance.reload import (
     ReloadIncomplete,
@@ -28,7 +28,7 @@ from holdfast.appliance.reload import (
     fingerprints,
     restart_reasons,
 )
-from holdfast.config import load
+from holdfast.config import Config, load
 from support import web, wire
 from support.certificates import Certificates, Issued, named
 from support.config_folder import written
@@ -266,6 +266,11 @@ LINK_CHANGED = "links.line: settings of a connection in use changed"
 DEVICE_CHANGED = (
     "devices.pump: in_flight, retry, tolerance or serial settings of a connection in use changed"
 )
+
+
+def test_each_section_is_replaced_or_compared_by_a_reload() -> None:
+    replaced = {*reload.SECTIONS, *reload.NAMED_SECTIONS}
+    assert replaced | {"logs", "workers", "audit", "profiles"} == Config.model_fields.keys()
 
 
 def test_each_reason_for_a_restart_is_told_in_the_order_of_the_docs(rig: Rig) -> None:

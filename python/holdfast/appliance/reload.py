@@ -30,25 +30,26 @@ class ReloadIncomplete(Exception):
     """An internal error after a part of the configuration has changed. Requires a restart."""
 
 
-SINGLE = ("identity", "rest", "mqtt", "nats", "gateway", "metrics", "log", "reload")
+SECTIONS = ("identity", "rest", "mqtt", "nats", "gateway", "metrics", "log", "reload")
+NAMED_SECTIONS = ("memories", "listeners", "devices", "links", "outputs", "adapters")
 OF_ALL_PROFILES = ("nats", "gateway")
 """Services that know the tags of every profile."""
 OF_ROUTES = ("queue", "priority", "coalesce", "cache")
 """Settings of a link that matter only for routes."""
-SEVERAL = ("memories", "listeners", "devices", "links", "outputs", "adapters")
 
 
 def fingerprints(config: Config) -> dict[str, str]:
-    """The fingerprint of each part of a configuration, by its key: `rest`, `devices.pump`.
+    """The fingerprint of each part that a reload can replace, by its key: `rest`, `devices.pump`.
 
-    Raises `NotAnswered`: the first file that does not answer ends it.
+    `restart_reasons` compares the others. Raises `NotAnswered` for a file that can't be read in
+    time.
     """
     return answered(lambda: _fingerprints(config))
 
 
 def _fingerprints(config: Config) -> dict[str, str]:
-    found = {key: fingerprint(getattr(config, key)) for key in SINGLE}
-    for key in SEVERAL:
+    found = {key: fingerprint(getattr(config, key)) for key in SECTIONS}
+    for key in NAMED_SECTIONS:
         for name, settings in getattr(config, key).items():
             found[f"{key}.{name}"] = fingerprint(settings)
     # The tags of a device are a part of it, but one profile is that of many devices.
@@ -60,7 +61,7 @@ def _fingerprints(config: Config) -> dict[str, str]:
         if getattr(config, key) is not None:
             found[key] += fingerprint(config.profiles)
     if config.mqtt is not None:
-        found["mqtt"] += fingerprint(list(config.mapped().items()))
+        found["mqtt"] += fingerprint(list(config.mqtt_tags().items()))
     return found
 
 
@@ -82,7 +83,7 @@ def described(changed: list[str], before: Config, now: Config) -> list[str]:
 def restart_reasons(before: Config, now: Config) -> Iterator[str]:
     """Yields what differs and takes effect only after a restart, so that a reload is refused.
 
-    In the order of the table in docs/operations.md.
+    In the order of the last row of the table in docs/operations.md.
     """
     for name, memory in before.memories.items():
         if name not in now.memories:

@@ -61,7 +61,8 @@ def _load_whole(path: Path | str) -> Config:
         raise ConfigError(str(path), report.problems)
     for place, message in warnings:
         report.warn(place, message)
-    return config.with_warnings([*config.warnings, *report.warnings]) if warnings else config
+    config.set_warnings([*config.warnings, *report.warnings])
+    return config
 
 
 def _checks(config: Config) -> Iterator[tuple[KeyPath, Callable[[], Iterable[str]]]]:

@@ -56,7 +56,8 @@ def loaded(path: Path | str) -> tuple[Config, yaml_document.Document]:
         content = yaml_document.read_bytes(Path(path), file)
         document, problems = yaml_document.parse(yaml_document.decoded(content, file), file)
         config = checked(document, problems, Path(path).absolute().parent)
-        return config.with_sha256(hashlib.sha256(content).hexdigest()), document
+        config.set_sha256(hashlib.sha256(content).hexdigest())
+        return config, document
 
     try:
         return bounded_files.answered(work)
@@ -79,15 +80,16 @@ def checked(document: yaml_document.Document, problems: list[Problem], folder: P
     profiles.read()
     expand_templates(report)
     take_out_former_keys(report)
-    config = build(report.document.data, folder, report).with_profile_files(profiles.files)
+    config = build(report.document.data, folder, report)
+    config.set_profile_files(profiles.files)
     scope = Scope(config, folder, report)
     _check(scope)
     problems = [*problems, *report.problems, *report.elsewhere]
     if problems:
         raise ConfigError(document.file, problems)
     _warn(scope)
-    warnings = sorted(report.warnings, key=lambda warning: warning.line or 0)
-    return config.with_warnings(warnings)
+    config.set_warnings(sorted(report.warnings, key=lambda warning: warning.line or 0))
+    return config
 
 
 def _check(scope: Scope) -> None:

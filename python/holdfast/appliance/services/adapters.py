@@ -50,7 +50,7 @@ class MqttService(Service):
             return
         from holdfast.adapters.mqtt import Mqtt
 
-        access, mapped = running.memory_access("mqtt"), config.mapped()
+        access, mapped = running.memory_access("mqtt"), config.mqtt_tags()
         factory = partial(Mqtt, settings, access, mapped, running.context.logs.restored)
         yield Supervisor("mqtt", factory, settings, list(mapped.items()), access=access)
 

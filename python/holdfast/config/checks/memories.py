@@ -226,7 +226,7 @@ def grants(config: Config) -> Iterator[WriterGrant]:
             path = ("mqtt", "subscriptions", index)
             sealed = topic.while_sealed or ()
             yield WriterGrant(path, topic.memories, topic.areas, True, sealed)
-        for index, mapped in enumerate(config.mapped().values()):
+        for index, mapped in enumerate(config.mqtt_tags().values()):
             path = ("mqtt", "map", index)
             yield WriterGrant(path, [mapped.memory], [mapped.tag.area], writes=True)
     for name, adapter in config.adapters.items():
@@ -333,7 +333,7 @@ def _warn_of_passed(config: Config, report: Report) -> None:
                     f"and its command is then sent to {listing(names)} twice"
                 )
                 report.warn(("mqtt", "subscriptions", later, "topic"), message)
-    for index, (memory, tag) in enumerate(config.mapped().values()):
+    for index, (memory, tag) in enumerate(config.mqtt_tags().values()):
         for name, into, addresses in passed:
             is_there = (into.memory, into.area) == (memory, tag.area)
             if is_there and tag.address < addresses.stop and addresses.start < tag.end:

@@ -7,7 +7,7 @@ of the keys, by way of the JSON Schema.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, PrivateAttr
 
@@ -95,14 +95,14 @@ class LogConfig(Model):
     names of the Elastic Common Schema, for a SIEM."""
 
 
-def _as_read(value: object) -> object:
-    """Profiles in files have been read before."""
+def _unchanged(value: object) -> object:
+    """Does nothing: its user only tells the JSON Schema about lists, which the loader replaces."""
     return value
 
 
 Profiles = Annotated[
     dict[Name, ProfileConfig],
-    BeforeValidator(_as_read, json_schema_input_type=dict[Name, ProfileConfig] | list[str]),
+    BeforeValidator(_unchanged, json_schema_input_type=dict[Name, ProfileConfig] | list[str]),
 ]
 
 
@@ -167,8 +167,8 @@ class Config(Model):
         own = {name: tag.tag(name, order) for name, tag in settings.tags.items()}
         return TagList({**{tag.name: tag for tag in tags}, **own}.values())
 
-    def mapped(self) -> dict[str, MappedTag]:
-        """What the topics of the MQTT client write that have plain values."""
+    def mqtt_tags(self) -> dict[str, MappedTag]:
+        """The tags that MQTT messages with a plain value write, by topic."""
         entries = () if self.mqtt is None else self.mqtt.map
         return {entry.topic: MappedTag(entry.memory, self._mapped(entry)) for entry in entries}
 
@@ -184,30 +184,27 @@ class Config(Model):
         """The files that profiles were read from."""
         return self._profile_files
 
-    def with_profile_files(self, files: Iterable[Path]) -> Self:
-        """This configuration, with profiles from these files."""
+    def set_profile_files(self, files: Iterable[Path]) -> None:
+        """Sets the files that profiles were read from."""
         self._profile_files = tuple(files)
-        return self
 
     @property
     def warnings(self) -> tuple[Problem, ...]:
         """Valid settings without effect, such as a rule that never matches."""
         return self._warnings
 
-    def with_warnings(self, warnings: Iterable[Problem]) -> Self:
-        """This configuration, with these warnings."""
+    def set_warnings(self, warnings: Iterable[Problem]) -> None:
+        """Sets the warnings."""
         self._warnings = tuple(warnings)
-        return self
 
     @property
     def sha256(self) -> str | None:
         """The SHA-256 of the file that this configuration was loaded from, if it was."""
         return self._sha256
 
-    def with_sha256(self, sha256: str) -> Self:
-        """This configuration, loaded from a file with that SHA-256."""
+    def set_sha256(self, sha256: str) -> None:
+        """Sets the SHA-256 of the file."""
         self._sha256 = sha256
-        return self
 
     def __eq__(self, other: object) -> bool:
         """Whether all settings are equal; warnings and file are not compared."""
