@@ -59,26 +59,27 @@ def health(
         raise click.UsageError("Give either FILE or --url.")
     if url is None:
         assert file is not None
-        base, context = _configured(file), _context(tls, verified=tls.ca is not None)
+        base, context = _url_from_config(file), _context(tls, verified=tls.ca is not None)
     else:
-        base, context = _checked(url), _context(tls, verified=True)
+        base, context = _checked_url(url), _context(tls, verified=True)
     path = probes.LIVE if live else probes.READY
     try:
-        found = _probe(base, path, timeout, context)
+        probe = _probe(base, path, timeout, context)
     except _NoAnswer as error:
         fail(f"{base}{path}: {error}", reason="connection", target=f"{base}{path}")
     state = "live" if live else "ready"
     if as_json:
-        failed = [name for name, check in found["checks"].items() if not check["ok"]]
-        wrong = {"reason": "not_" + state, "detail": ", ".join(failed)} if not found["ok"] else {}
-        answer = {"ok": found["ok"], "target": f"{base}{path}", **wrong, "checks": found["checks"]}
+        failed = [name for name, check in probe["checks"].items() if not check["ok"]]
+        failure = {} if probe["ok"] else {"reason": f"not_{state}", "detail": ", ".join(failed)}
+        answer = {"ok": probe["ok"], "target": f"{base}{path}", **failure}
+        answer["checks"] = probe["checks"]
         print_json(answer, indent=2)
     else:
-        click.echo(_shown(found, state))
-    sys.exit(ExitCode.SUCCESS if found["ok"] else ExitCode.FAILED)
+        click.echo(_shown(probe, state))
+    sys.exit(ExitCode.SUCCESS if probe["ok"] else ExitCode.FAILED)
 
 
-def _configured(file: Path) -> str:
+def _url_from_config(file: Path) -> str:
     """The URL of the service in a configuration. Exits with 2 if it has none."""
     from holdfast.config import ConfigError, load
 
@@ -99,15 +100,18 @@ def _configured(file: Path) -> str:
     raise click.UsageError(f"{file} has no section {sections}, which answer probes.")
 
 
-def _checked(url: str) -> str:
-    """The scheme, host and port of a URL. Raises `click.BadParameter`."""
+def _checked_url(url: str) -> str:
+    """The URL without a slash at its end.
+
+    Raises `click.BadParameter` unless it has only scheme, host and port.
+    """
     try:
         parts = urlsplit(url)
         valid = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
     except ValueError:
         valid, parts = False, urlsplit("")
     if not valid or parts.path not in ("", "/") or parts.query or parts.fragment or parts.username:
-        allowed = "allowed: http://HOST:PORT or https://HOST:PORT"
+        allowed = "allowed: http://HOST[:PORT] or https://HOST[:PORT]"
         raise click.BadParameter(f"found {url!r}, {allowed}.", param_hint="'--url'")
     return url.removesuffix("/")
 
@@ -159,7 +163,7 @@ def _response(
             status, body = response.status, response.read(MAX_ANSWER_BYTES)
     except TimeoutError:
         return _NoAnswer(f"no answer in {timeout:g} s")
-    # A `ValueError`: a host that is no name.
+    # `ValueError`: the host is not a valid name.
     except (OSError, http.client.HTTPException, ValueError) as error:
         return _NoAnswer(plain(str(error)) or type(error).__name__)
     try:

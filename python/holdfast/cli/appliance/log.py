@@ -52,9 +52,9 @@ def backup(file: Path, folder: Path, name: str | None) -> None:
 
     Nodes may run. What is written after the backup is not in it.
     """
-    with _servers(file, name) as (found, _, servers):
-        messages = log_backup.back_up(servers, found, folder)
-    click.echo(f"Backed up: log {found}, {messages} messages.")
+    with _open_log(file, name) as (log_name, _, servers):
+        messages = log_backup.back_up(servers, log_name, folder)
+    click.echo(f"Backed up: log {log_name}, {messages} messages.")
 
 
 @log.command(epilog="Example: holdfast log restore plant.yaml site-backup")
@@ -66,9 +66,9 @@ def restore(file: Path, folder: Path, name: str | None) -> None:
 
     The log gets the `replicas` of FILE. No node of it may run.
     """
-    with _servers(file, name) as (found, settings, servers):
-        messages = log_backup.restore(servers, found, settings.replicas, folder)
-    click.echo(f"Restored: log {found}, {messages} messages, {settings.replicas} replicas.")
+    with _open_log(file, name) as (log_name, settings, servers):
+        messages = log_backup.restore(servers, log_name, settings.replicas, folder)
+    click.echo(f"Restored: log {log_name}, {messages} messages, {settings.replicas} replicas.")
 
 
 @log.command(epilog="Example: holdfast log replicas plant.yaml")
@@ -76,20 +76,23 @@ def restore(file: Path, folder: Path, name: str | None) -> None:
 @log_option
 def replicas(file: Path, name: str | None) -> None:
     """Set the number of servers that store the log to `replicas` in FILE. Nodes may run."""
-    with _servers(file, name) as (found, settings, servers):
-        changed = log_backup.set_replicas(servers, found, settings.replicas)
+    with _open_log(file, name) as (log_name, settings, servers):
+        changed = log_backup.set_replicas(servers, log_name, settings.replicas)
     for stream, (before, now) in changed.items():
         click.echo(f"{stream}: {before} -> {now}" if before != now else f"{stream}: {now}")
 
 
 @contextmanager
-def _servers(file: Path, name: str | None) -> Iterator[tuple[str, SharedLogConfig, Servers]]:
-    """The log of that name, its settings and servers. Exits with 1 if they can't be used."""
+def _open_log(file: Path, name: str | None) -> Iterator[tuple[str, SharedLogConfig, Servers]]:
+    """Yields the name of the log, its settings and its servers.
+
+    Exits with 1 if they can't be used, or if the body raises `BackupFailed`.
+    """
     config = load_or_exit(file)
-    found = chosen_log(config, name)
-    settings = config.logs[found]
+    log_name = chosen_log(config, name)
+    settings = config.logs[log_name]
     try:
-        with stops_as_ctrl_c(), log_servers.running(found, settings):
-            yield found, settings, nats_servers(settings)
+        with stops_as_ctrl_c(), log_servers.running(log_name, settings):
+            yield log_name, settings, nats_servers(settings)
     except (ServerUnusable, log_backup.BackupFailed) as error:
-        fail(f"logs.{found}: {error}")
+        fail(f"logs.{log_name}: {error}")

@@ -39,17 +39,17 @@ def identify(url: str, unit: int, timeout: float, as_json: bool) -> None:
     Exit codes: 0 the device supports at least one, 1 neither, 2 wrong usage.
     """
     with device.connect(url, unit, timeout) as client:
-        identification = answer_of(client.identify)
-        server_id = answer_of(client.report_server_id)
-    said = [each for each in (identification, server_id) if not isinstance(each, ModbusError)]
+        identification = result_or_error(client.identify)
+        server_id = result_or_error(client.report_server_id)
+    answered = [each for each in (identification, server_id) if not isinstance(each, ModbusError)]
     if as_json:
         answer = {
-            "ok": bool(said),
+            "ok": bool(answered),
             "target": url,
             "unit": unit,
-            **(device_errors.problem(identification) if not said else {}),
-            "identification": answer_to_json(identification, _identification),
-            "server_id": answer_to_json(server_id, _server_id),
+            **(device_errors.problem(identification) if not answered else {}),
+            "identification": answer_to_json(identification, _identification_json),
+            "server_id": answer_to_json(server_id, _server_id_json),
         }
         print_json(answer, indent=2)
     elif isinstance(identification, ModbusError) and isinstance(server_id, ModbusError):
@@ -57,15 +57,15 @@ def identify(url: str, unit: int, timeout: float, as_json: bool) -> None:
         click.echo(f"holdfast: {url}: function 17: {server_id}", err=True)
     else:
         sections = (
-            section("Device identification (function 43/14)", identification, _identified),
-            section("Server id (function 17)", server_id, _served),
+            section("Device identification (function 43/14)", identification, _identification_rows),
+            section("Server id (function 17)", server_id, _server_id_rows),
         )
         click.echo("\n\n".join(sections))
-    if not said:
+    if not answered:
         sys.exit(ExitCode.FAILED)
 
 
-def answer_of(call: Callable[[], Answer]) -> Answer | ModbusError:
+def result_or_error(call: Callable[[], Answer]) -> Answer | ModbusError:
     """The result of a call, or its error."""
     try:
         return call()
@@ -74,33 +74,33 @@ def answer_of(call: Callable[[], Answer]) -> Answer | ModbusError:
 
 
 def answer_to_json(
-    answer: Answer | ModbusError, made: Callable[[Answer], dict[str, object]]
+    answer: Answer | ModbusError, to_json: Callable[[Answer], dict[str, object]]
 ) -> dict[str, object]:
     """An answer, or its error, for JSON."""
     if isinstance(answer, ModbusError):
         return {"ok": False, **device_errors.problem(answer)}
-    return {"ok": True, **made(answer)}
+    return {"ok": True, **to_json(answer)}
 
 
 def section(
-    head: str, answer: Answer | ModbusError, made: Callable[[Answer], list[tuple[str, str]]]
+    head: str, answer: Answer | ModbusError, to_rows: Callable[[Answer], list[tuple[str, str]]]
 ) -> str:
     """A heading, and an answer as indented lines of names and texts, or its error."""
     bold = terminal_text.styled(head, bold=True)
     if isinstance(answer, ModbusError):
         return f"{bold}\n  {terminal_text.styled(str(answer), fg='red')}"
-    rows = made(answer)
+    rows = to_rows(answer)
     width = max(len(name) for name, _ in rows)
     return "\n".join([bold, *(f"  {name:{width}}  {text}".rstrip() for name, text in rows)])
 
 
-def _identification(answer: Identification) -> dict[str, object]:
+def _identification_json(answer: Identification) -> dict[str, object]:
     names = {name: getattr(answer, name) for name in OBJECT_NAMES}
     objects = {str(number): data.hex() for number, data in sorted(answer.objects.items())}
     return {**names, "conformity_level": answer.conformity_level, "objects": objects}
 
 
-def _server_id(answer: ServerId) -> dict[str, object]:
+def _server_id_json(answer: ServerId) -> dict[str, object]:
     return {
         "server_id": answer.server_id,
         "running": answer.running,
@@ -109,7 +109,7 @@ def _server_id(answer: ServerId) -> dict[str, object]:
     }
 
 
-def _identified(answer: Identification) -> list[tuple[str, str]]:
+def _identification_rows(answer: Identification) -> list[tuple[str, str]]:
     level = LEVELS.get(answer.conformity_level & 0x7F)
     rows = [
         (_name(number), _text(data) if number < 0x80 or _is_text(data) else data.hex(" "))
@@ -119,15 +119,15 @@ def _identified(answer: Identification) -> list[tuple[str, str]]:
     return [*rows, ("conformity level", f"{code}, {level}" if level else code)]
 
 
-def _served(answer: ServerId) -> list[tuple[str, str]]:
-    rows = [("bytes", answer.data.hex(" "))]
+def _server_id_rows(answer: ServerId) -> list[tuple[str, str]]:
+    rows = []
     if answer.server_id is not None:
-        rows.insert(0, ("server id", str(answer.server_id)))
+        rows.append(("server id", str(answer.server_id)))
     if answer.running is not None:
-        rows.insert(1, ("running", "yes" if answer.running else "no"))
+        rows.append(("running", "yes" if answer.running else "no"))
         if answer.additional and _is_text(answer.additional):
-            rows.insert(2, ("text", _text(answer.additional)))
-    return rows
+            rows.append(("text", _text(answer.additional)))
+    return [*rows, ("bytes", answer.data.hex(" "))]
 
 
 def _name(number: int) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli import device_errors
-from holdfast.cli.devices.identify import answer_of, answer_to_json, section
+from holdfast.cli.devices.identify import answer_to_json, result_or_error, section
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options import device
 from holdfast.cli.options.option import json_option
@@ -34,9 +34,9 @@ def status(url: str, unit: int, timeout: float, as_json: bool) -> None:
     Exit codes: 0 the device supports at least one, 1 none, 2 wrong usage.
     """
     with device.connect(url, unit, timeout) as client:
-        outputs = answer_of(client.read_exception_status)
-        counter = answer_of(client.event_counter)
-        log = answer_of(client.event_log)
+        outputs = result_or_error(client.read_exception_status)
+        counter = result_or_error(client.event_counter)
+        log = result_or_error(client.event_log)
     answers = (outputs, counter, log)
     ok = not all(isinstance(each, ModbusError) for each in answers)
     if as_json:
