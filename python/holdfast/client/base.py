@@ -60,7 +60,7 @@ class BaseClient:
         if is_broadcast(self.target, unit):
             code = request.pdu[0]
             if code not in BROADCAST_CODES:
-                raise ValueError(f"{BROADCAST}, not allowed for function {code}")
+                raise ValueError(f"{BROADCAST}; function {code} can't be broadcast")
         return unit
 
 

@@ -65,8 +65,8 @@ class _Block:
     count: int
     fields: list[_Field]
     decode: Decoder
-    width: int
-    """The bytes that one request has to read together: the block, or elements of an array."""
+    element_bytes: int
+    """Of registers, the bytes to read in one request: the block, or an element of a long array."""
     requested_in: int = 0
     """The number of the last reading that requested it; 0 is none."""
     answered: bool = True
@@ -110,8 +110,8 @@ class TagReader:
         self._readings: dict[int, Reading] = {}
         self._blocks: list[_Block] = []
         self._planned = 0.0
-        self._is_whole = False
-        """Whether the blocks are those of the plan, as nothing has been refused."""
+        self._is_as_planned = False
+        """Whether nothing has been refused, so that the blocks are still those of the plan."""
 
     @property
     def requests(self) -> list[tuple[Area, int, int]]:
@@ -168,9 +168,9 @@ class TagReader:
     def _plan(self) -> None:
         """Makes blocks of all tags, at first and some time after a refusal."""
         now = self._clock()
-        if self._blocks and (self._is_whole or now - self._planned < REFUSAL_RETRY_S):
+        if self._blocks and (self._is_as_planned or now - self._planned < REFUSAL_RETRY_S):
             return
-        self._planned, self._is_whole = now, True
+        self._planned, self._is_as_planned = now, True
         fields: dict[tuple[Area, int, int], _Field] = {}
         for index, tag in enumerate(self.tags):
             place = tag.area, tag.span.start, len(tag.span)
@@ -193,8 +193,8 @@ class TagReader:
         area, decode = found[0].area, decoder(tags, address, count)
         # A block that exceeds one request is one range, with arrays of its whole length.
         is_long = count > READ_LIMITS[area]
-        width = math.lcm(*(tag.of_type.width for tag in tags)) if is_long else 2 * count
-        return _Block(area, address, count, found, decode, width)
+        element_bytes = math.lcm(*(tag.of_type.width for tag in tags)) if is_long else 2 * count
+        return _Block(area, address, count, found, decode, element_bytes)
 
     def _request(self, block: _Block) -> Steps[tuple[list[_Block], ModbusError | None]]:
         """Reads a block. Returns the blocks that replace it, and the error of a silent device."""
@@ -203,7 +203,7 @@ class TagReader:
             data = yield block
         except ModbusError as error:
             if isinstance(error, ModbusException) and error.code in ILLEGAL:
-                self._is_whole = False
+                self._is_as_planned = False
                 if len(block.fields) > 1:
                     return (yield from self._bisect(block))
                 block.refused = error
@@ -244,7 +244,7 @@ def _fetch(client: SyncClient, block: _Block) -> bytes:
     """The bytes of a block, as in a Modbus reply."""
     area, address, count = block.area, block.address, block.count
     if area not in BIT_AREAS:
-        kind = f"bytes:{block.width}[{2 * count // block.width}]"
+        kind = f"bytes:{block.element_bytes}[{2 * count // block.element_bytes}]"
         return b"".join(client.read(area, address, kind))
     read_bits = client.read_coils if area == "coils" else client.read_discrete_inputs
     return packed(read_bits(address, count))

@@ -12,17 +12,18 @@ JITTER = 0.25
 """With jitter, a pause is up to this fraction shorter at random."""
 
 PROVEN_S = 60.0
-"""What has run for so long has started well: its next pause is the first again."""
+"""After an attempt that worked for this long, the next failure counts as the first."""
 
 _MAX_DOUBLINGS = 31
+"""Prevents an overflow, as in backoff.rs."""
 
 
 class Backoff:
     """Counts failures in a row, and returns the pause after each of them.
 
     `jitter` is for clients of a server that many share: they lose it together, and should not come
-    back together. After an attempt that worked for `proven_s` seconds, pauses
-    start from the first again; without it, only after `succeeded`.
+    back together. After an attempt that worked for `proven_s` seconds, pauses start from the first
+    again; without it, only after `succeeded`.
     """
 
     def __init__(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from holdfast.values.types import Type
 
 INTEGERS = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q"}
-MAX = {
+FLOAT_MAX = {
     "float16": 65504.0,
     "float32": 3.4028234663852886e38,
     "float64": 1.7976931348623157e308,
@@ -37,8 +37,8 @@ MAX_EXACT = 1 << 53
 
 def limits(base: str) -> tuple[float, float]:
     """The least and the greatest number of a type. Of integers and BCD, both are integers."""
-    if base in MAX:
-        return -MAX[base], MAX[base]
+    if base in FLOAT_MAX:
+        return -FLOAT_MAX[base], FLOAT_MAX[base]
     size = FIXED[base]
     if base.startswith("bcd"):
         return 0, 10 ** (2 * size) - 1
@@ -50,15 +50,14 @@ def nearest_float(number: float | Fraction, base: str) -> float:
     """The nearest number of a floating-point type. Raises `OverflowError` beyond the type."""
     form = f">{FLOATS[base]}"
     # Of an integer beyond the type, `struct` has an error of its own.
-    found: float = struct.unpack(form, struct.pack(form, float_for(number, base)))[0]
+    found: float = struct.unpack(form, struct.pack(form, round_to_odd(number, base)))[0]
     return found
 
 
-def float_for(number: Any, base: str) -> float:
+def round_to_odd(number: Any, base: str) -> float:
     """The float that `struct` rounds to the nearest number of a type.
 
-    Rounded to 53 bits and then to fewer, a number can become the one that is second nearest. This
-    does not happen if the last of the 53 bits is 1 wherever they do not hold the number itself.
+    Avoids double rounding: an inexact number is rounded to odd at 53 bits (Boldo and Melquiond).
     """
     found = float(number)
     if base == "float64" or found == number or struct.pack("<d", found)[0] % 2:
@@ -173,7 +172,7 @@ class Float(Number):
         if isinstance(value, bool) or not isinstance(value, Real):
             raise DoesNotFit(f"{shown(value)} is not a number, which {self.name} requires")
         integer = as_integer(value)  # Those of NumPy are rounded to compare them with floats.
-        number = float_for(value if integer is None else integer, self.name)
+        number = round_to_odd(value if integer is None else integer, self.name)
         # A float of numpy with more bits, which `float` does not refuse.
         if isinf(number) and value != number:
             raise OverflowError
