@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.adapters.mqtt import adapter, answers, connection, inbox, sessions
+from holdfast.adapters.mqtt import adapter, connection, inbox, response_topics, sessions
 from holdfast.ingest import MemoryAccess
-from holdfast.net.mqtt import client, connect
+from holdfast.net.mqtt import client
 from holdfast.net.mqtt.broker_socket import BrokerSocket
+from holdfast.net.mqtt.dial import dial
 from support import mqtt_peer as mqtt
 from support import wire
 from support.mqtt_peer import FakeBroker, publish
@@ -616,7 +617,7 @@ class Jammed(socket.socket):
 def test_nothing_piles_up_while_the_broker_does_not_read(
     rig: Rig, fake5: FakeBroker, monkeypatch: pytest.MonkeyPatch, qos: int
 ) -> None:
-    dial, read = connect.dial, connection.BrokerConnection.read_more
+    read = connection.BrokerConnection.read_more
     most = {"packets": 0, "answers": 0}
 
     def dial_one_that_jams(*arguments: Any) -> BrokerSocket:
@@ -648,11 +649,11 @@ def test_nothing_piles_up_while_the_broker_does_not_read(
 
         assert running.status()["answers_dropped"] > 0
         assert (
-            answers.MAX_WAITING_ANSWERS
+            response_topics.MAX_WAITING_ANSWERS
             <= most["packets"]
-            <= connection.MAX_UNSENT_PACKETS + answers.MAX_WAITING_ANSWERS
+            <= connection.MAX_UNSENT_PACKETS + response_topics.MAX_WAITING_ANSWERS
         )
-        assert most["answers"] <= answers.MAX_WAITING_ANSWERS
+        assert most["answers"] <= response_topics.MAX_WAITING_ANSWERS
 
         Jammed.jam.clear()  # the broker reads again, and things go on
         for _ in range(5000 if qos else 0):
