@@ -191,7 +191,7 @@ def test_a_note_names_what_is_not_converted_unchanged(
          "7: replicator.units[0].reads[0].addinvert: found true, allowed: false; nothing here "
          "inverts bits"),
         ("status_unit_id: 100", "status_unit_id: 0100",
-         "12: replicator.units[0].targets[0].status_unit_id: found 0100, which the replicator read "
+         "12: replicator.units[0].targets[0].status_unit_id: found 0100, which the source read "
          "as octal, allowed: 64, or 100 if that is meant"),
         ("{3: 1000}", "{'3': 1000}",
          "14: replicator.units[0].targets[0].memories[0].offsets.3: found '3', allowed: a function "
