@@ -44,7 +44,7 @@ def test_a_program_gets_all_guesses(server: holdfast.Server, memory: holdfast.Me
 
 def test_a_known_value_is_looked_for(server: holdfast.Server, memory: holdfast.Memory) -> None:
     memory.write("holding_registers", 41, [215])
-    arguments = ("--like", "21.5", "--anywhere", "--count", "60", "--modicon", *AT_ONCE)
+    arguments = ("--like", "21.5", "--anywhere", "--count", "60", *AT_ONCE)
     _, _, columns, *best = done("describe", "guess", cli.url(server), "40001", *arguments)
     assert "times" in columns
     assert any(

@@ -50,7 +50,7 @@ def test_the_help_imports_no_command() -> None:
         (("import", "mmaa"), "No such command 'mmaa'. Did you mean 'mma'?"),
         (("xyzzy",), "No such command 'xyzzy'."),
         (("tcp://plc",), "Did you mean 'holdfast read tcp://plc'?"),
-        (("read", "tcp://plc", "hr", "0", "--modcon"), "'--modicon'?)"),
+        (("read", "tcp://plc", "hr", "0", "--jsn"), "'--json'?)"),
         (("read", "plc", "hr", "0"), "for a host of that name, type tcp://plc."),
         (("read", "/dev/ttyUSB0", "hr", "0"), "type rtu:///dev/ttyUSB0?baud=19200&parity=even"),
         (("read", "COM3", "hr", "0"), "'holdfast find COM3' finds them."),

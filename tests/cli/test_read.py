@@ -298,17 +298,15 @@ def test_what_is_no_value_is_told_and_the_others_are_shown(
         ("3x00011", "input_registers", 10),
         ("10001", "discrete_inputs", 0),
         ("00002", "coils", 1),
-        ("0x0010", "coils", 9),
         ("000016", "coils", 15),
     ],
 )
 def test_a_modicon_number_names_area_and_address(
     server: holdfast.Server, number: str, area: str, address: int
 ) -> None:
-    found = answer("read", cli.url(server), number, "--modicon")
+    found = answer("read", cli.url(server), number)
     assert (found["area"], found["address"]) == (area, address)
-    assert answer("read", cli.url(server), area, number, "1", "--modicon") == found
-    head, row = done("read", cli.url(server), number, "--modicon")
+    head, row = done("read", cli.url(server), number)
     assert (head.split()[0], row.split()[0]) == (area, str(address))
 
 
@@ -316,13 +314,12 @@ def test_a_modicon_number_names_area_and_address(
     ("words", "told"),
     [
         (
-            ("41", "--modicon"),
-            "'41' is not a Modicon number, as in 40001, 400001 or 4x0001, and 0,",
+            ("40000",),
+            "'40000' is not a Modicon number, as in 40001, 400001 or 4x0001, and 0,",
         ),
-        (("40000", "--modicon"), "'40000' is not a Modicon number"),
-        (("465537", "--modicon"), "'465537' is not a Modicon number"),
-        (("20001", "--modicon"), "'20001' is not a Modicon number"),
-        (("coils", "40001", "--modicon"), "40001 is in holding_registers, not in coils."),
+        (("465537",), "'465537' is not a Modicon number"),
+        (("20001",), "'20001' has no area"),
+        (("hr", "40001", "--modicon"), "no --modicon any more: type the number alone, as in 40001"),
         (("100",), "'100' has no area: type hr:100 for a holding register, counted from 0"),
         (("0x0001",), "type co:0 for the Modicon number, or name the area of the address 1"),
         (("hr:0", "40001"), "type --count 40001 for that many, or hr:0 for the Modicon number."),

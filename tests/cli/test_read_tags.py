@@ -96,7 +96,7 @@ def test_modicon_numbers_have_types_as_well(
     server: holdfast.Server, memory: holdfast.Memory
 ) -> None:
     memory.write("holding_registers", 9, [65535])
-    found = answer("read", cli.url(server), "40010:int16", "40010:uint16", "--modicon")
+    found = answer("read", cli.url(server), "40010:int16", "40010:uint16")
     assert found["values"] == {"hr:9:int16": -1, "hr:9:uint16": 65535}
 
 
@@ -387,7 +387,6 @@ def test_a_signal_leaves_a_whole_recording(
             ("--config", __file__, "--profile", "x"),
             "--config can't be used with --tags or --profile.",
         ),
-        (("--tags", "x.csv", "--modicon"), "--modicon can't be used with tags."),
     ],
 )
 def test_wrong_usage_is_told(words: tuple[str, ...], told: str) -> None:

@@ -49,6 +49,11 @@ OLD_OPTIONS: Mapping[str, Mapping[str, str]] = {
 }
 """For each command, what its old options are now; `{}` is the value, `{range}` FIRST-LAST of it."""
 
+GONE = {
+    "--modicon": "type the number alone, as in 40001 or 4x0001, or 00001 for a coil",
+}
+"""Options that no command has any more, and what to do instead."""
+
 
 def _range(text: str) -> str:
     """AREA:FIRST-LAST of AREA:ADDRESS:COUNT."""
@@ -75,6 +80,8 @@ def renewed(command: str, args: Sequence[str], *, silent: bool) -> list[str]:
         name, sign, value = word.partition("=")
         if word == "--":
             return [*found, word, *left, *items]
+        if name in GONE and not silent:
+            click.get_current_context().fail(f"There is no {name} any more: {GONE[name]}")
         new = old.get(name)
         if new is None:
             found.append(word)

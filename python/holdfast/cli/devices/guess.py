@@ -14,7 +14,6 @@ from holdfast.cli.options import device, item
 from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import flag, json_option, number_option, option
-from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import url_argument
 from holdfast.cli.terminal_text import print_json
 from holdfast.discovery import type_guess
@@ -45,7 +44,6 @@ MAX_REGISTERS_SHOWN = 12
 @number_option("--times", "Number of readings, to observe changes.", 1, 1000, 5)
 @every_option("0.5", "Interval between readings.")
 @flag("--all everything", f"Show all guesses, not only the best {MAX_GUESSES}.")
-@modicon_option
 @device.device_options
 @json_option
 def guess(
@@ -57,7 +55,6 @@ def guess(
     times: int,
     every: float,
     everything: bool,
-    modicon: bool,
     unit: int,
     timeout: float,
     as_json: bool,
@@ -74,7 +71,7 @@ def guess(
 
     Exit codes: 0 done, 1 can't read the registers, 2 wrong usage.
     """
-    place, count = item.single(words, modicon=modicon, count=count)
+    place, count = item.single(words, count)
     if place.area in BIT_AREAS:
         raise click.UsageError(f"{place.area} contain bits; guess requires registers.")
     if like is not None and not math.isfinite(like):

@@ -23,7 +23,6 @@ from holdfast.cli.options.option import (
     require_known,
     whole_number,
 )
-from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import checked_url, is_url
 from holdfast.cli.options.value_type import typed
 from holdfast.cli.terminal_text import print_json
@@ -76,7 +75,6 @@ def _cost(text: str) -> tuple[float, float]:
 @option("--forbidden", "AREA:FIRST-LAST", "Never read these ranges.", range_of, multiple=True)
 @choice("--preset", "Also count the requests of this rule.", get_args(Preset))
 @number_option("--fill", f"Largest gap that max_insert reads.  [default: {FILL}]", 0)
-@modicon_option
 @json_option
 def plan(
     target: str,
@@ -84,7 +82,6 @@ def plan(
     names: tuple[str, ...],
     preset: Preset | None,
     fill: int | None,
-    modicon: bool,
     as_json: bool,
     **rules: Any,
 ) -> None:
@@ -99,7 +96,7 @@ def plan(
         raise click.UsageError("--max-gap and --cost can't be used together.")
     if fill is not None and preset != "max_insert":
         raise click.UsageError("--fill requires --preset max_insert.")
-    reads = _reads(words, modicon)
+    reads = _reads(words)
     given = {key: value for key, value in rules.items() if value not in (None, ())}
     try:
         if is_url(target):
@@ -119,18 +116,18 @@ def plan(
         click.echo("\n".join(_lines(each, other)))
 
 
-def _reads(words: Sequence[str], modicon: bool) -> list[Field]:
+def _reads(words: Sequence[str]) -> list[Field]:
     """Area, address and count of items."""
     reads: list[Field] = []
     left = list(words)
     while left:
-        each, rest = item.take(left, modicon=modicon)
+        each, rest = item.take(left)
         size = each.count or 1
         if each.type is not None:
             of = typed(each.type, each.order, None, each.place.area, 1)
             size = of.registers if of else 0
         elif each.count is None and rest and whole_number(rest[0]) is not None:
-            item.are_several(left, modicon=modicon)
+            item.are_several(left)
             size = whole_number(rest.pop(0)) or 0
         if not 1 <= size <= ADDRESSES - each.place.address:
             raise click.UsageError(

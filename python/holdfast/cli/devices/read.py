@@ -18,7 +18,7 @@ from holdfast.cli.options import device, item
 from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option
-from holdfast.cli.options.plc_addresses import modicon_hint, modicon_option
+from holdfast.cli.options.plc_addresses import modicon_hint
 from holdfast.cli.options.value_type import typed, typed_options
 from holdfast.cli.signals import stops_as_ctrl_c
 from holdfast.cli.tags import options as tag_options
@@ -55,7 +55,6 @@ MIN_VALUE_COLUMNS = 14
 @number_option("--times", "With --every: stop after N readings.")
 @tag_options.tag_file_options
 @tag_options.selection_options
-@modicon_option
 @device.device_options
 @json_option
 def read(
@@ -69,7 +68,6 @@ def read(
     times: int | None,
     files: TagFiles,
     selection: Selection,
-    modicon: bool,
     unit: int,
     timeout: float,
     as_json: bool,
@@ -82,7 +80,7 @@ def read(
 
     AREA is coils, discrete_inputs, holding_registers or input_registers; co, di, hr, ir, or any
     unambiguous prefix. Beside it, ADDRESS counts from 0, decimal or 0x. Modicon numbers count from
-    1 and include the area (0, 1, 3, 4); with --modicon, also the number beside an area is one.
+    1 and include the area (0, 1, 3, 4).
 
     URL is tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502,
     rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200 or
@@ -96,7 +94,7 @@ def read(
         None
         if in_no_area
         else tag_options.device_of(
-            files, url, words, selection.only, (kind, order, encoding), modicon, unit, timeout
+            files, url, words, selection.only, (kind, order, encoding), unit, timeout
         )
     )
     if of is not None:
@@ -121,13 +119,13 @@ def read(
         raise click.UsageError("Missing argument 'ITEM' (AREA ADDRESS, AREA:ADDRESS), or --tags.")
     query: _Query | Records
     if in_no_area:
-        if kind is not None or order != "ABCD" or encoding is not None or modicon or every:
+        if kind is not None or order != "ABCD" or encoding is not None or every:
             raise click.UsageError(
-                f"--type, --order, --encoding, --modicon and --every can't be used with {words[0]}."
+                f"--type, --order, --encoding and --every can't be used with {words[0]}."
             )
         query = device_items.to_read(words, count)
     else:
-        query = _query(words, modicon, count, kind, order, encoding)
+        query = _query(words, count, kind, order, encoding)
     fields = {"target": url, "unit": unit, **query.to_json()}
     with device.connect(url, unit, timeout) as client:
         if every is not None and isinstance(query, _Query):
@@ -152,13 +150,12 @@ def read(
 
 def _query(
     words: Sequence[str],
-    modicon: bool,
     count: int | None,
     kind: str | None,
     order: str,
     encoding: str | None,
 ) -> _Query:
-    first, named = item.take_range(words, modicon=modicon)
+    first, named = item.take_range(words)
     if named is not None and count is not None:
         raise click.UsageError("COUNT and --count are the same: give only one.")
     if first.type is not None:

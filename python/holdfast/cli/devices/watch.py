@@ -20,7 +20,6 @@ from holdfast.cli.options import device, item
 from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option, option, require_known
-from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import checked_url, is_url
 from holdfast.cli.progress import bar
 from holdfast.cli.signals import stops_as_ctrl_c
@@ -54,7 +53,6 @@ TOKEN = "HOLDFAST_TOKEN"
 @number_option("--times", "Stop after N readings.")
 @tag_options.tag_file_options
 @tag_options.selection_options
-@modicon_option
 @device.device_options
 @json_option
 def watch(
@@ -65,7 +63,6 @@ def watch(
     times: int | None,
     files: TagFiles,
     selection: Selection,
-    modicon: bool,
     unit: int,
     timeout: float,
     as_json: bool,
@@ -91,9 +88,7 @@ def watch(
     click.get_current_context().with_resource(stops_as_ctrl_c())
     if is_url(target) or files.config is not None:
         untyped = (None, "ABCD", None)
-        of = tag_options.device_of(
-            files, target, words, selection.only, untyped, modicon, unit, timeout
-        )
+        of = tag_options.device_of(files, target, words, selection.only, untyped, unit, timeout)
         if of is not None:
             from holdfast.cli.tags import source as tag_source
             from holdfast.cli.tags import watch as tagged_watch
@@ -105,7 +100,7 @@ def watch(
             with tag_source.opened(of, selection) as tagged:
                 tagged_watch.watch_tags(tagged, form, every, times)
             return
-    elif files.given or item.are_several(words, modicon=modicon):
+    elif files.given or item.are_several(words):
         raise click.UsageError("AREA:ADDRESS and --tags require URL, not FILE.")
     selection.refuse()
     url = is_url(target)
@@ -113,7 +108,7 @@ def watch(
         raise click.UsageError("--memory requires FILE.")
     chosen = None
     if words:
-        place, count = item.single(words, modicon=modicon)
+        place, count = item.single(words)
         chosen = place, count or 1
     if url:
         source = _device(checked_url(target), chosen, unit, timeout)

@@ -18,7 +18,6 @@ from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options import device, item
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import flag, json_option
-from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.value_type import typed, typed_options
 from holdfast.cli.signals import stops_as_ctrl_c
 from holdfast.cli.tags import options as tag_options
@@ -73,7 +72,6 @@ class _Write(click.Command):
 @flag("--split", "Allow several requests if one is not enough.")
 @flag("--verify", "Read the values back and compare.")
 @flag("--dry-run", "Print the requests (PDU) in hex and send nothing.")
-@modicon_option
 @device.device_options
 @json_option
 def write(
@@ -86,7 +84,6 @@ def write(
     split: bool,
     verify: bool,
     dry_run: bool,
-    modicon: bool,
     unit: int,
     timeout: float,
     as_json: bool,
@@ -95,7 +92,7 @@ def write(
 
     ITEM is hr:0, hr 0, 40001, 4x0001 or %MW0, with a type and an order as in hr:0:float32:CDAB.
     Its area is coils or holding_registers; co, hr or any prefix. Beside an area, ADDRESS counts
-    from 0, decimal or 0x; with --modicon, it is a Modicon number. file:4:7 is record 7 of file 4.
+    from 0, decimal or 0x. file:4:7 is record 7 of file 4.
 
     Coils take true, false, on, off, 1, 0; registers take 0 to 65535, decimal or 0x. With --type,
     VALUEs are of that type: text for a string, hex for bytes. bit:N writes one bit of a register
@@ -111,11 +108,11 @@ def write(
     """
     click.get_current_context().with_resource(stops_as_ctrl_c())
     in_no_area = device_items.is_named(words)
-    is_changed = kind is not None or order != "ABCD" or encoding is not None or split or modicon
+    is_changed = kind is not None or order != "ABCD" or encoding is not None or split
     if is_changed and (files.given or in_no_area):
         what = "tags" if files.given else words[0]
         raise click.UsageError(
-            f"--type, --order, --encoding, --split and --modicon can't be used with {what}."
+            f"--type, --order, --encoding and --split can't be used with {what}."
         )
     if files.given:
         from holdfast.cli.tags import write as tagged_write
@@ -132,7 +129,7 @@ def write(
         return
     if "=" in words[0]:
         raise click.UsageError(f"{words[0]!r}: NAME=VALUE requires --tags or --config.")
-    first, left = item.take(words, modicon=modicon)
+    first, left = item.take(words)
     place = first.place
     as_they_are = click.get_current_context().meta[AS_THEY_ARE]
     for word in left[: max(0, len(left) - as_they_are)]:

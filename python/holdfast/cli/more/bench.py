@@ -16,7 +16,6 @@ from holdfast.cli.options import device, item
 from holdfast.cli.options.duration import time_option, timeout_option
 from holdfast.cli.options.item import words_argument
 from holdfast.cli.options.option import json_option, number_option
-from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.options.url import url_argument
 from holdfast.cli.progress import bar
 from holdfast.cli.terminal_text import print_json
@@ -37,7 +36,6 @@ COUNT = 10
 @number_option("--in-flight", "Requests in flight on each connection.", 1, 1024, 1)
 @time_option("--duration", "Duration of the test.", "5")
 @number_option("--count", "Same as COUNT: bits or registers per request.", 1, READ_BITS)
-@modicon_option
 @device.unit_option()
 @timeout_option()
 @json_option
@@ -48,7 +46,6 @@ def bench(
     in_flight: int,
     duration: float,
     count: int | None,
-    modicon: bool,
     unit: int,
     timeout: float,
     as_json: bool,
@@ -68,7 +65,7 @@ def bench(
     """
     # An area alone is the one from its first address on.
     words = (words[0], "0") if len(words) == 1 and words[0].isalpha() else words or ("hr", "0")
-    place, count = item.single(words, modicon=modicon, count=count)
+    place, count = item.single(words, count)
     asked = {"unit": unit, "connections": connections, "in_flight": in_flight}
     fields: dict[str, object] = {"target": url, **asdict(place), **asked}
 

@@ -13,7 +13,6 @@ from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.duration import timeout_option
 from holdfast.cli.options.item import take, words_argument
 from holdfast.cli.options.option import flag, json_option, option, whole_number
-from holdfast.cli.options.plc_addresses import modicon_option
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.url import Receiver, parse_receiver
 from holdfast.protocol import MAX_WORD
@@ -70,7 +69,6 @@ def _receiver(text: str) -> Receiver:
 @option("--file", "FILE", "Read the values from a file; -: standard input.", FILE)
 @option("--hex payload", "BYTES", "Payload as on the wire, in hex.")
 @option("--count", "N", "Number of bits in --hex.", _word)
-@modicon_option
 @timeout_option(
     f"{raw_ingest.TIMEOUT_S:g}",
     "Time limit for connection, packet and reply together.",
@@ -86,7 +84,6 @@ def raw_send(
     file: IO[str] | None,
     payload: str | None,
     count: int | None,
-    modicon: bool,
     timeout: float,
     dry_run: bool,
     as_json: bool,
@@ -100,7 +97,7 @@ def raw_send(
 
     Exit codes: 0 written, 1 refused or possibly not written, 2 wrong usage.
     """
-    item, texts = take(words, modicon=modicon)
+    item, texts = take(words)
     if item.type is not None or item.count is not None:
         raise click.UsageError(f"{item.text!r}: only an area and an address can be used here.")
     area, address, values = item.place.area, item.place.address, [_integer(each) for each in texts]

@@ -105,14 +105,14 @@ def range_of(text: str) -> tuple[Area, int, int]:
     return area_of(area), found.start, found.stop
 
 
-def take(words: Sequence[str], *, modicon: bool = False) -> tuple[Item, list[str]]:
+def take(words: Sequence[str]) -> tuple[Item, list[str]]:
     """Parses the item at the start of the arguments. Returns it and the remaining arguments."""
     left = list(words)
     if not left:
         raise click.UsageError("Missing argument 'AREA'.")
     text = left.pop(0)
     head, *parts = text.split(":")
-    place, count = of_number(head, modicon=modicon), None
+    place, count = of_number(head), None
     if place is None:
         area = area_of(head)
         if not parts:
@@ -120,7 +120,7 @@ def take(words: Sequence[str], *, modicon: bool = False) -> tuple[Item, list[str
                 raise click.UsageError("Missing argument 'ADDRESS'.")
             parts = left.pop(0).split(":")
             text = f"{text}:{':'.join(parts)}"
-        place, count = _addressed(parts.pop(0), area, modicon=modicon)
+        place, count = _addressed(parts.pop(0), area)
     kind = parts.pop(0).lower() if parts else None
     if kind in SIZED and parts:
         kind = f"{kind}:{parts.pop(0)}"
@@ -130,9 +130,9 @@ def take(words: Sequence[str], *, modicon: bool = False) -> tuple[Item, list[str
     return Item(text, place, count, kind, order), left
 
 
-def take_range(words: Sequence[str], *, modicon: bool = False) -> tuple[Item, int | None]:
+def take_range(words: Sequence[str]) -> tuple[Item, int | None]:
     """Parses an item and an optional COUNT after it, which is all that may be there."""
-    item, left = take(words, modicon=modicon)
+    item, left = take(words)
     if item.count is not None and left:
         raise click.UsageError(f"{item.text!r} and COUNT: give only one.")
     if len(left) > 1:
@@ -145,14 +145,12 @@ def take_range(words: Sequence[str], *, modicon: bool = False) -> tuple[Item, in
     return item, count
 
 
-def single(
-    words: Sequence[str], *, modicon: bool, count: int | None = None
-) -> tuple[Place, int | None]:
+def single(words: Sequence[str], count: int | None = None) -> tuple[Place, int | None]:
     """Parses an item without a type, and the number of its addresses, if it is named.
 
     `count` is the value of `--count`.
     """
-    item, named = take_range(words, modicon=modicon)
+    item, named = take_range(words)
     if item.type is not None:
         raise click.UsageError(f"{item.text!r}: a type can't be used here.")
     if named is not None and count is not None:
@@ -165,11 +163,11 @@ def single(
     return place, named
 
 
-def are_several(words: Sequence[str], *, modicon: bool) -> bool:
+def are_several(words: Sequence[str]) -> bool:
     """Whether arguments are items with names of their own, not one item and its COUNT."""
     if not words:
         return False
-    item, left = take(words, modicon=modicon)
+    item, left = take(words)
     if not left:
         return ":" in words[0] and item.count is None
     if whole_number(left[0]) is None:
@@ -202,9 +200,9 @@ def words_argument(metavar: str, *, required: bool = False) -> Callable[[Command
     )
 
 
-def _addressed(text: str, area: Area, *, modicon: bool) -> tuple[Place, int | None]:
+def _addressed(text: str, area: Area) -> tuple[Place, int | None]:
     """The place of an address beside its area, and the number of addresses of FIRST-LAST."""
-    if modicon or re.fullmatch("[134][xX][0-9]+", text):
+    if re.fullmatch("[134][xX][0-9]+", text):
         place = of_modicon(text)
         if place.area != area:
             raise click.UsageError(f"{text} is in {place.area}, not in {area}.")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli.options.option import flag, whole_number
+from holdfast.cli.options.option import whole_number
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.types import AREAS, BIT_AREAS, SHORT_OF
 
@@ -37,8 +37,6 @@ IEC_READINGS = {
 }
 """What addresses of IEC 61131-3 may mean that controllers use in several ways."""
 
-modicon_option = flag("--modicon", "Addresses are Modicon numbers, also beside an area: hr 40001.")
-
 
 @dataclass(frozen=True)
 class Place:
@@ -48,12 +46,12 @@ class Place:
     address: int
 
 
-def of_number(text: str, *, modicon: bool) -> Place | None:
+def of_number(text: str) -> Place | None:
     """The place of a number that names its area: Modicon's, or IEC's. `None` for other text."""
     if text.startswith("%"):
         return of_iec(text)
     match = MODICON_NUMBER.fullmatch(text)
-    if match is not None and text[:2] in ("0x", "0X") and not modicon:
+    if match is not None and text[:2] in ("0x", "0X"):
         meant = of_modicon(text).address
         raise click.UsageError(
             f"{text!r} is not clear: type co:{meant} for the Modicon number, or name the area of "
@@ -61,7 +59,7 @@ def of_number(text: str, *, modicon: bool) -> Place | None:
         )
     if near := suggested_bit(text):
         raise click.UsageError(f"{text!r} is not an item{near}")
-    if match is not None or (modicon and not text[:1].isalpha()):
+    if match is not None:
         return of_modicon(text)
     if whole_number(text) is not None:
         raise click.UsageError(

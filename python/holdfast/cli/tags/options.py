@@ -113,7 +113,6 @@ def device_of(
     words: Sequence[str],
     only: Sequence[str],
     typed: tuple[str | None, str, str | None],
-    modicon: bool,
     unit: int,
     timeout: float,
 ) -> TaggedDevice | None:
@@ -122,7 +121,7 @@ def device_of(
     `typed` are the values of `--type`, `--order` and `--encoding`.
     """
     kind, order, encoding = typed
-    if not files.given and not item.are_several(words, modicon=modicon):
+    if not files.given and not item.are_several(words):
         return None
     from holdfast.cli.tags import selection
 
@@ -131,13 +130,11 @@ def device_of(
     if files.given:
         if encoding is not None:
             raise click.UsageError("--encoding can't be used with tags.")
-        if modicon:
-            raise click.UsageError("--modicon can't be used with tags.")
         if words:
             raise click.UsageError(f"{' '.join(words)!r} can't be used with --tags or --config.")
         found = files.device(url, unit, timeout)
     else:
-        tags = selection.items(words, modicon=modicon, encoding=encoding)
+        tags = selection.items(words, encoding=encoding)
         found = selection.TaggedDevice(url, unit, timeout, tags)
     return replace(found, tags=selection.chosen(found.tags, only))
 

@@ -55,12 +55,12 @@ def chosen(tags: TagList, only: Sequence[str]) -> TagList:
     return TagList(tag for tag in tags if any(fnmatchcase(tag.name, pattern) for pattern in only))
 
 
-def items(words: Sequence[str], *, modicon: bool, encoding: str | None) -> TagList:
+def items(words: Sequence[str], *, encoding: str | None) -> TagList:
     """Parses items; an array, or FIRST-LAST, is one tag for each element."""
     found: list[tuple[Tag, str]] = []
     left = list(words)
     while left:
-        each, left = item.take(left, modicon=modicon)
+        each, left = item.take(left)
         found += _item(each, encoding)
         if len(found) > MAX_TAGS:
             raise click.UsageError(f"{each.text!r}: more than {MAX_TAGS} values.")
