@@ -119,7 +119,7 @@ def test_no_answer_after_the_first_is_a_failure() -> None:
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("tcp://127.0.0.1", "--count", "126"), "count is 126, allowed: 1 to 125."),
+        (("tcp://127.0.0.1", "hr:0", "126"), "count is 126, allowed: 1 to 125."),
         (("tcp://127.0.0.1", "hr:65530", "10"), "the last address is 65535."),
         (
             ("udp://127.0.0.1", "--in-flight", "2"),

@@ -33,9 +33,7 @@ def test_the_best_guess_is_first(server: holdfast.Server, memory: holdfast.Memor
 
 def test_a_program_gets_all_guesses(server: holdfast.Server, memory: holdfast.Memory) -> None:
     memory.write("input_registers", 0, [215])
-    found = answer(
-        "describe", "guess", cli.url(server), "ir", "0", *AT_ONCE, "--times", "2", "--count", "1"
-    )
+    found = answer("describe", "guess", cli.url(server), "ir", "0", "1", *AT_ONCE, "--times", "2")
     assert (found["ok"], found["area"], found["reads"]) == (True, "input_registers", [[215]] * 2)
     best = found["guesses"][0]
     assert (best["type"], best["also"], best["values"]) == ("uint16", "int16", [215, 215])
@@ -44,7 +42,7 @@ def test_a_program_gets_all_guesses(server: holdfast.Server, memory: holdfast.Me
 
 def test_a_known_value_is_looked_for(server: holdfast.Server, memory: holdfast.Memory) -> None:
     memory.write("holding_registers", 41, [215])
-    arguments = ("--like", "21.5", "--anywhere", "--count", "60", *AT_ONCE)
+    arguments = ("60", "--like", "21.5", "--anywhere", *AT_ONCE)
     _, _, columns, *best = done("describe", "guess", cli.url(server), "40001", *arguments)
     assert "times" in columns
     assert any(
@@ -73,9 +71,7 @@ def test_what_changes_is_shown_from_the_first_to_the_last() -> None:
         return bytes([3, 2]) + next(numbers).to_bytes(2)
 
     with FakeDevice(counting) as device:
-        lines = done(
-            "describe", "guess", device.url, "hr", "0", "--count", "1", "--times", "3", *AT_ONCE
-        )
+        lines = done("describe", "guess", device.url, "hr", "0", "1", "--times", "3", *AT_ONCE)
     assert lines[0] == "holding_registers 0 to 0: 0868, 3 reads"
     assert lines[3].split()[-5:] == ["2150", "…", "2152", "changes", "smoothly"]
 
@@ -86,7 +82,7 @@ def test_fewer_registers_are_looked_at_where_there_are_no_more(
     memory.write("holding_registers", 997, [1, 2, 3])
     [head, *_] = done("describe", "guess", cli.url(server), "hr", "997", *AT_ONCE)
     assert head.startswith("holding_registers 997 to 999: 0001 0002 0003")
-    [head, *_] = done("describe", "guess", cli.url(server), "hr", "998", *AT_ONCE, "--count", "2")
+    [head, *_] = done("describe", "guess", cli.url(server), "hr", "998", "2", *AT_ONCE)
     assert head.startswith("holding_registers 998 to 999")
 
 
@@ -102,7 +98,7 @@ def test_errors_are_told(server: holdfast.Server) -> None:
         f"holdfast: {url}: exception 02 (Illegal Data Address)",
         f"hint: 'holdfast describe map {url}' finds the addresses that exist",
     ]
-    assert failure("describe", "guess", url, "hr", "999", "--count", "2")
+    assert failure("describe", "guess", url, "hr", "999", "2")
     assert answer("describe", "guess", url, "hr", "1000", code=1)["code"] == 2
 
 
@@ -111,9 +107,8 @@ def test_errors_are_told(server: holdfast.Server) -> None:
     [
         (("co", "0"), "coils contain bits; guess requires registers."),
         (("hr", "0", "4", "5"), "Got unexpected extra argument (5)."),
-        (("hr", "65535", "--count", "2"), "the last address is 65535"),
+        (("hr", "65535", "2"), "the last address is 65535"),
         (("hr", "0", "--like", "nan"), "--like requires a finite number."),
-        (("hr", "0", "--count", "126"), "found 126, allowed: 1 to 125."),
     ],
 )
 def test_wrong_usage_is_told(server: holdfast.Server, words: tuple[str, ...], told: str) -> None:

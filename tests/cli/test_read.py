@@ -91,7 +91,7 @@ def test_records_of_a_file_and_a_queue_are_read() -> None:
             "fifo": 1246,
             "registers": [7, 65535, 0],
         }
-        many = answer("read", device.url, "file:4:0", "--count", "300")
+        many = answer("read", device.url, "file:4:0", "300")
         assert many["registers"] == list(range(300))
     asked = [pdu.hex() for pdu in device.asked]
     assert asked[:2] == ["1407060004" + "00d70002", "1804de"]
@@ -139,7 +139,6 @@ def test_a_file_that_does_not_exist_is_told() -> None:
         (("file:1:0", "0"), "count is 0"),
         (("file:1:0", "x"), "COUNT is 'x'"),
         (("file:1:0", "1", "2"), "unexpected extra argument (2)"),
-        (("file:1:0", "1", "--count", "2"), "give only one"),
         (("file:1:0", "--type", "int16"), "can't be used with file:1:0"),
         (("fifo:1", "--every", "1s"), "can't be used with fifo:1"),
     ],
@@ -322,8 +321,8 @@ def test_a_modicon_number_names_area_and_address(
         (("hr", "40001", "--modicon"), "no --modicon any more: type the number alone, as in 40001"),
         (("100",), "'100' has no area: type hr:100 for a holding register, counted from 0"),
         (("0x0001",), "type co:0 for the Modicon number, or name the area of the address 1"),
-        (("hr:0", "40001"), "type --count 40001 for that many, or hr:0 for the Modicon number."),
-        (("40001", "40003"), "type --count 40003 for that many, or hr:2 for the Modicon number."),
+        (("hr:0", "40001"), "type hr:0-40000 for that many, or hr:0 for the Modicon number."),
+        (("40001", "40003"), "type hr:0-40002 for that many, or hr:2 for the Modicon number."),
         (("ir", "4x0001"), "4x0001 is in holding_registers, not in input_registers."),
         (("hr", "400001"), "did you mean hr:0, Modicon's 400001?"),
         (("%MD4",), "type hr:4:uint32 or hr:8:uint32, as controllers count words or pairs"),
@@ -346,13 +345,12 @@ def test_a_modicon_number_names_area_and_address(
         (("hr", "0", "0"), "COUNT is '0', allowed: 1 to 65536."),
         (("hr", "0", "x"), "COUNT is 'x', allowed: 1 to 65536."),
         (("hr", "0", "1", "2"), "Got unexpected extra argument (2)."),
-        (("hr", "0", "1", "--count", "2"), "COUNT and --count are the same: give only one."),
         (("hr", "65535", "2"), "2 registers from address 65535: the last address is 65535."),
         (("hr", "0", "--order", "CDAB"), "--order and --encoding require --type."),
         (("hr", "0", "--type", "float33"), "type 'float33' is unknown"),
         (("hr", "0", "--type", "float32", "--order", "ABDC"), "order 'ABDC' is unknown"),
         (("co", "0", "--type", "float32"), "coils contain bits; the only type is bool."),
-        (("hr", "0", "--times", "2"), "--times requires --every."),
+        (("hr", "0", "--times", "2"), "--times requires --every. For 10 values, type hr:0 10."),
         (
             ("hr", "0", "--every", "nan"),
             "'nan' is not a time, as in 500ms, 2s or 2 (seconds): more than 0, up to 86400 s.",
@@ -436,7 +434,7 @@ def test_an_item_is_written_in_many_ways(server: holdfast.Server, memory: holdfa
         found = cli.answer("read", url, *words)
         assert (found["area"], found["address"]) == ("holding_registers", 0)
         assert found["registers"] == [1]
-    for text in ("hr:0 2", "hr:0-1", "40001 2", "%MW0 --count 2"):
+    for text in ("hr:0 2", "hr:0-1", "40001 2", "%MW0 2"):
         assert cli.answer("read", url, *text.split())["registers"] == [1, 2]
     assert cli.answer("read", url, "hr:0:UINT32", "2")["values"] == [0x10002, 0x30004]
     assert cli.answer("read", url, "hr", "0:uint32")["values"] == [0x10002]
@@ -449,6 +447,12 @@ def test_old_options_work_with_a_hint(server: holdfast.Server) -> None:
     result = invoke("watch", url, "hr:0", "--count=1")
     assert result.exit_code == 0
     assert result.stderr.startswith("hint: '--count 1' is now '--times 1'\n")
+    result = invoke("read", url, "hr:0", "--count", "2")
+    assert result.exit_code == 2
+    assert result.stderr.startswith("hint: '--count 2' is now '--times 2'\n")
+    result = invoke("describe", "guess", url, "--count", "2", "hr:0", "--every", "1ms")
+    assert result.stderr == "hint: '--count 2' is now '2'\n"
+    assert result.stdout.startswith("holding_registers 0 to 1:")
     result = invoke("bench", url, "--area", "ir", "--address", "2", "--seconds", "0.05")
     assert result.stderr.splitlines() == [
         "hint: '--area ir' is now 'ir'",

@@ -379,7 +379,7 @@ def test_a_signal_leaves_a_whole_recording(
         (("hr:0:uint16[9000]",), "more than 8192 values"),
         (("hr:0", "hr:0"), "two tags have the name 'hr:0:uint16'"),
         (("hr:0", "--type", "float32"), "--type and --order can't be used with AREA:ADDRESS"),
-        (("hr:0", "--count", "2"), "--times requires --every."),
+        (("hr:0", "--times", "2"), "--times requires --every."),
         (("hr", "0", "--csv"), "--csv requires AREA:ADDRESS or --tags."),
         (("hr", "0", "--record", "x.csv"), "--record requires AREA:ADDRESS or --tags."),
         (("--profile", "x"), "--profile requires --tags."),

@@ -236,7 +236,7 @@ def forgetful(pdu: bytes) -> bytes | None:
         "describe map URL --json",
         "describe identify URL",
         "describe status URL",
-        "bench URL hr:0 --count 1",
+        "bench URL hr:0 1",
         "write URL hr 0 7 --verify",
         "write URL file:4:0 7 --verify",
         "write URL level=7 --tags TAGS --verify",

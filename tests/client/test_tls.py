@@ -649,7 +649,7 @@ def test_commands(device: Address, authority: Authority, plc: Owner, tmp_path: P
         url = relay.url(ca=authority.ca)
         told = answer("read", url, "hr", "0", "3")
         assert told["registers"] == [11, 22, 33]
-        told = answer("bench", url, "--count", "3", "--in-flight", "4", "--duration", "50ms")
+        told = answer("bench", url, "hr:0", "3", "--in-flight", "4", "--duration", "50ms")
         assert told["errors"] == {}
 
         [told] = failure("read", relay.url(ca=authority.ca, name="plc7"), "hr", "0")

@@ -21,6 +21,7 @@ OLD_NAMES = {
 }
 """Names of commands: scripts have them."""
 
+_COUNT = {"--count": "{}"}
 _READS = {"--reads": "--times {}"}
 _LOG = {"--json-log": "--log-format json"}
 _DEVICE_FILES = {f"--tls-{file}": f"--device-{file} {{}}" for file in ("ca", "cert", "key")}
@@ -29,10 +30,11 @@ OLD_OPTIONS: Mapping[str, Mapping[str, str]] = {
         "--seconds": "--duration {}",
         "--area": "{}",
         "--address": "{}",
+        **_COUNT,
     },
     "check plan": {"--read": "{range}"},
     "describe": _READS,
-    "describe guess": _READS,
+    "describe guess": _READS | _COUNT,
     "gateway": {
         "--hosts": "--host {}",
         "--sources": "--source {}",
@@ -43,6 +45,7 @@ OLD_OPTIONS: Mapping[str, Mapping[str, str]] = {
     },
     "log replay": {"--port": "--bind :{}"},
     "proxy": {"--listen": "--bind {}", "--read-only": "--access read-only", **_LOG},
+    "read": {"--count": "--times {}"},
     "scan": {"--scan-rate": "--every {}ms"},
     "simulate": {"--port": "--bind :{}"},
     "watch": {"--count": "--times {}"},

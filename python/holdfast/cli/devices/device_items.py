@@ -79,7 +79,7 @@ class Records:
         return registers_table("record", self.first, raw)
 
 
-def to_read(words: Sequence[str], count: int | None) -> Records:
+def to_read(words: Sequence[str]) -> Records:
     """Parses an item to read, and its COUNT. Raises `click.UsageError`."""
     file, first, left = _parts(words)
     if len(left) > 1:
@@ -87,15 +87,13 @@ def to_read(words: Sequence[str], count: int | None) -> Records:
     named = whole_number(left[0]) if left else None
     if left and named is None:
         raise click.UsageError(f"COUNT is {left[0]!r}, allowed: the number of records.")
-    if named is not None and count is not None:
-        raise click.UsageError("COUNT and --count are the same: give only one.")
     if file is None:
-        if named is not None or count is not None:
+        if named is not None:
             raise click.UsageError("fifo:ADDRESS takes no COUNT: a queue is read as a whole.")
         with device.usable():
             Request.read_queue(first)
         return Records(None, first, None)
-    size = count or 1 if named is None else named
+    size = 1 if named is None else named
     with device.usable():
         # What the client would refuse, which splits what is too much for one request.
         requests.read_file_requests(file, first, size)

@@ -18,7 +18,6 @@ from holdfast.cli.options.url import url_argument
 from holdfast.cli.terminal_text import print_json
 from holdfast.discovery import type_guess
 from holdfast.errors import ModbusError
-from holdfast.protocol import READ_REGISTERS
 from holdfast.types import BIT_AREAS
 from holdfast.values.json import jsonable
 
@@ -38,7 +37,6 @@ MAX_REGISTERS_SHOWN = 12
 @click.command(epilog="Example: holdfast describe guess tcp://192.168.0.10 hr 100 --like 21.5")
 @url_argument
 @words_argument(item.RANGE, required=True)
-@number_option("--count", "Same as COUNT.", 1, READ_REGISTERS)
 @flag("--anywhere", "Also try values that start at any later register.")
 @option("--like", "NUMBER", "Expected value.", float)
 @number_option("--times", "Number of readings, to observe changes.", 1, 1000, 5)
@@ -49,7 +47,6 @@ MAX_REGISTERS_SHOWN = 12
 def guess(
     url: str,
     words: tuple[str, ...],
-    count: int | None,
     anywhere: bool,
     like: float | None,
     times: int,
@@ -71,7 +68,7 @@ def guess(
 
     Exit codes: 0 done, 1 can't read the registers, 2 wrong usage.
     """
-    place, count = item.single(words, count)
+    place, count = item.single(words)
     if place.area in BIT_AREAS:
         raise click.UsageError(f"{place.area} contain bits; guess requires registers.")
     if like is not None and not math.isfinite(like):

@@ -13,7 +13,6 @@ from holdfast.cli import answers, device_errors, terminal_text
 from holdfast.cli.devices import device_items
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.live import schedule
-from holdfast.cli.old_spellings import hint
 from holdfast.cli.options import device, item
 from holdfast.cli.options.duration import every_option
 from holdfast.cli.options.item import words_argument
@@ -50,7 +49,6 @@ MIN_VALUE_COLUMNS = 14
 @tag_options.url_argument
 @words_argument(item.ITEMS)
 @typed_options
-@number_option("--count", "Same as COUNT.", 1, ADDRESSES)
 @every_option(None, "Repeat the read until Ctrl-C.")
 @number_option("--times", "With --every: stop after N readings.")
 @tag_options.tag_file_options
@@ -63,7 +61,6 @@ def read(
     kind: str | None,
     order: str,
     encoding: str | None,
-    count: int | None,
     every: float | None,
     times: int | None,
     files: TagFiles,
@@ -89,6 +86,8 @@ def read(
     Exit codes: 0 all values read, 1 some values not read, 2 wrong usage.
     """
     click.get_current_context().with_resource(stops_as_ctrl_c())
+    if times is not None and every is None:
+        raise click.UsageError("--times requires --every. For 10 values, type hr:0 10.")
     in_no_area = device_items.is_named(words) and not files.given
     of = (
         None
@@ -102,18 +101,8 @@ def read(
         from holdfast.cli.tags import source as tag_source
 
         form = tag_options.form_of(as_json, selection.csv)
-        if count is not None:
-            # Earlier versions counted the readings of several values with it.
-            if every is None and count > 1:
-                raise click.UsageError("--times requires --every.")
-            hint(f"--count {count}", f"--times {count}")
-            times = times or count
-        elif times is not None and every is None:
-            raise click.UsageError("--times requires --every.")
         with tag_source.opened(of, selection) as source:
             sys.exit(tagged_read.read_tags(source, form, every, times))
-    if times is not None and every is None:
-        raise click.UsageError("--times requires --every.")
     selection.refuse()
     if not words:
         raise click.UsageError("Missing argument 'ITEM' (AREA ADDRESS, AREA:ADDRESS), or --tags.")
@@ -123,9 +112,9 @@ def read(
             raise click.UsageError(
                 f"--type, --order, --encoding and --every can't be used with {words[0]}."
             )
-        query = device_items.to_read(words, count)
+        query = device_items.to_read(words)
     else:
-        query = _query(words, count, kind, order, encoding)
+        query = _query(words, kind, order, encoding)
     fields = {"target": url, "unit": unit, **query.to_json()}
     with device.connect(url, unit, timeout) as client:
         if every is not None and isinstance(query, _Query):
@@ -150,19 +139,16 @@ def read(
 
 def _query(
     words: Sequence[str],
-    count: int | None,
     kind: str | None,
     order: str,
     encoding: str | None,
 ) -> _Query:
-    first, named = item.take_range(words)
-    if named is not None and count is not None:
-        raise click.UsageError("COUNT and --count are the same: give only one.")
+    first, count = item.take_range(words)
     if first.type is not None:
         if kind is not None or order != "ABCD":
             raise click.UsageError("--type and --order can't be used with AREA:ADDRESS:TYPE.")
         kind, order = first.type, first.order
-    place, asked_count = first.place, named or count or 1
+    place, asked_count = first.place, count or 1
     asked = typed(kind, order, encoding, place.area, asked_count)
     query = _Query(place, asked_count if asked is None else asked.registers, asked)
     if place.address + query.size > ADDRESSES:

@@ -21,7 +21,6 @@ from holdfast.cli.progress import bar
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.load import MAX_CONNECTIONS, Load
 from holdfast.errors import ModbusError
-from holdfast.protocol import READ_BITS
 
 QUANTILES = {"p50": 0.5, "p90": 0.9, "p99": 0.99}
 BAR_COLUMNS = 40
@@ -35,7 +34,6 @@ COUNT = 10
 @number_option("--connections", "Number of concurrent connections.", 1, MAX_CONNECTIONS, 1)
 @number_option("--in-flight", "Requests in flight on each connection.", 1, 1024, 1)
 @time_option("--duration", "Duration of the test.", "5")
-@number_option("--count", "Same as COUNT: bits or registers per request.", 1, READ_BITS)
 @device.unit_option()
 @timeout_option()
 @json_option
@@ -45,7 +43,6 @@ def bench(
     connections: int,
     in_flight: int,
     duration: float,
-    count: int | None,
     unit: int,
     timeout: float,
     as_json: bool,
@@ -65,7 +62,7 @@ def bench(
     """
     # An area alone is the one from its first address on.
     words = (words[0], "0") if len(words) == 1 and words[0].isalpha() else words or ("hr", "0")
-    place, count = item.single(words, count)
+    place, count = item.single(words)
     asked = {"unit": unit, "connections": connections, "in_flight": in_flight}
     fields: dict[str, object] = {"target": url, **asdict(place), **asked}
 

@@ -7,7 +7,7 @@ area themselves. A spelling with two readings is refused, and the error names bo
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import TYPE_CHECKING
 
 import click
@@ -145,22 +145,17 @@ def take_range(words: Sequence[str]) -> tuple[Item, int | None]:
     return item, count
 
 
-def single(words: Sequence[str], count: int | None = None) -> tuple[Place, int | None]:
-    """Parses an item without a type, and the number of its addresses, if it is named.
-
-    `count` is the value of `--count`.
-    """
-    item, named = take_range(words)
+def single(words: Sequence[str]) -> tuple[Place, int | None]:
+    """Parses an item without a type, and the number of its addresses, if it is named."""
+    item, count = take_range(words)
     if item.type is not None:
         raise click.UsageError(f"{item.text!r}: a type can't be used here.")
-    if named is not None and count is not None:
-        raise click.UsageError("COUNT and --count are the same: give only one.")
-    place, named = item.place, named or count
-    if place.address + (named or 1) > ADDRESSES:
+    place = item.place
+    if place.address + (count or 1) > ADDRESSES:
         raise click.UsageError(
-            f"{named} from address {place.address}: the last address is {LAST_ADDRESS}."
+            f"{count} from address {place.address}: the last address is {LAST_ADDRESS}."
         )
-    return place, named
+    return place, count
 
 
 def are_several(words: Sequence[str]) -> bool:
@@ -170,7 +165,8 @@ def are_several(words: Sequence[str]) -> bool:
     item, left = take(words)
     if not left:
         return ":" in words[0] and item.count is None
-    if whole_number(left[0]) is None:
+    count = whole_number(left[0])
+    if count is None:
         # `hr 0 x` has a wrong COUNT, `hr 0 hr 4` and `hr 0 4x0003` have another item.
         return (
             ":" in words[0]
@@ -180,10 +176,10 @@ def are_several(words: Sequence[str]) -> bool:
     has_own_area = ":" in words[0] or not words[0][:1].isalpha()
     match = MODICON_NUMBER.fullmatch(left[0])
     if has_own_area and match is not None:
-        meant = of_modicon(left[0])
+        meant, (area, first) = of_modicon(left[0]), astuple(item.place)
         raise click.UsageError(
-            f"{left[0]!r} is not clear: type --count {left[0]} for that many, or "
-            f"{SHORT_OF[meant.area]}:{meant.address} for the Modicon number."
+            f"{left[0]!r} is not clear: type {SHORT_OF[area]}:{first}-{first + count - 1} for that "
+            f"many, or {SHORT_OF[meant.area]}:{meant.address} for the Modicon number."
         )
     return False
 
