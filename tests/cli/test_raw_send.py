@@ -19,7 +19,6 @@ from support import wire
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from click.testing import Result
 
@@ -28,13 +27,13 @@ if TYPE_CHECKING:
 THREE = "52490103000100000003006400c8012c"
 
 
-def run(*arguments: str, text: str | bytes | None = None) -> Result:
-    return CliRunner().invoke(main, ["raw-send", *arguments], input=text)
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(main, ["raw-send", *arguments])
 
 
-def usage_error(*arguments: str, text: str | bytes | None = None) -> str:
+def usage_error(*arguments: str) -> str:
     """The last line of what wrong usage is answered with."""
-    result = run(*arguments, text=text)
+    result = run(*arguments)
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr.startswith("Usage: main raw-send")
     return result.stderr.splitlines()[-1]
@@ -133,11 +132,6 @@ def test_an_address_without_a_colon_is_never_another_address() -> None:
             ("holding_registers", "0", "100", "200", "300", "--memory-id", "1", "--no-crc"),
             "524901000300000100000003006400c8012c",
         ),
-        (("holding_registers", "0", "--hex", "0064 00C8 012c", "--unit", "1"), THREE),
-        (
-            ("discrete_inputs", "8", "--hex", "ed", "--count", "5", "--unit", "1"),
-            "52490102000100080005ed",
-        ),
         (
             ("discrete_inputs", "0", "1", "0", "1", "1", "0", "--unit", "1"),
             "524901020001000000050d",
@@ -153,46 +147,6 @@ def test_a_dry_run_prints_the_packet_and_sends_nothing(
     assert (result.exit_code, json.loads(result.stdout)["packet"]) == (0, packet)
 
 
-@pytest.mark.parametrize(
-    "text",
-    ["100\n200\n0x12c\n", "100,200,300", " 100; 200 ;\t300 ", "\ufeff100, 200,\r\n\r\n300,\r\n"],
-)
-def test_values_come_from_a_file_or_standard_input(text: str, tmp_path: Path) -> None:
-    file = tmp_path / "values.csv"
-    file.write_text(text)
-    arguments = ("127.0.0.1:9000", "holding_registers", "0", "--unit", "1", "--dry-run")
-    assert run(*arguments, "--file", str(file)).stdout == f"{THREE}\n"
-    assert run(*arguments, "--file", "-", text=text).stdout == f"{THREE}\n"
-
-
-def test_a_file_has_a_whole_area(tmp_path: Path) -> None:
-    file = tmp_path / "values.csv"
-    file.write_text("65535\n" * 65535)
-    arguments = ("127.0.0.1:9000", "holding_registers", "0", "--unit", "1", "--dry-run")
-    result = run(*arguments, "--file", str(file))
-    assert result.stdout == "5249010300010000ffff" + "ffff" * 65535 + "\n"
-    file.write_text("1\n" * 65536)
-    assert usage_error(*arguments, "--file", str(file)) == (
-        f"Error: {file} has more than 65535 values."
-    )
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        (b"1\n2,x\n", "Error: <stdin>:2: 'x' is not an integer, decimal or 0x."),
-        (b"1\n2.5\n", "Error: <stdin>:2: '2.5' is not an integer, decimal or 0x."),
-        (b"-1\n", "Error: <stdin>:1: '-1' is not an integer, decimal or 0x."),
-        (b"1\n\xff\n", "Error: <stdin> is not UTF-8 text."),
-        (b"1\n65536\n", "Error: values[1] is 65536, allowed: integers 0 to 65535."),
-        (b"", "Error: found 0 values, allowed: 1 to 65535."),
-    ],
-)
-def test_a_wrong_value_in_a_file_is_named(text: bytes, told: str) -> None:
-    arguments = ("127.0.0.1:9000", "holding_registers", "0", "--unit", "1", "--file", "-")
-    assert usage_error(*arguments, text=text) == told
-
-
 RIGHT = ("127.0.0.1:9000", "coils", "0", "1", "--unit", "1")
 
 
@@ -205,17 +159,10 @@ RIGHT = ("127.0.0.1:9000", "coils", "0", "1", "--unit", "1")
             "Error: Give either --unit (format v1) or --memory-id (format",
         ),
         ((*RIGHT, "--no-crc"), "Error: --no-crc requires --memory-id."),
-        ((*RIGHT, "--count", "1"), "Error: --count requires --hex."),
-        ((*RIGHT, "--hex", "01"), "Error: Give exactly one of VALUEs, --file and --hex."),
-        ((*RIGHT[:3], "--unit", "1"), "Error: Give exactly one of VALUEs, --file and --hex."),
+        ((*RIGHT[:3], "--unit", "1"), "Error: found 0 values, allowed: 1 to 65535."),
         ((*RIGHT[:3], "2", "--unit", "1"), "Error: values[0] is 2, allowed: 0, 1, False, True."),
         ((*RIGHT[:3], "1.0", "--unit", "1"), "Error: '1.0' is not"),
         ((*RIGHT[:3], "1_0", "--unit", "1"), "Error: '1_0' is not"),
-        (
-            (*RIGHT[:3], "--hex", "1", "--unit", "1"),
-            "Error: --hex is '1', allowed: pairs of hex",
-        ),
-        ((*RIGHT[:3], "--hex", "01", "--unit", "1"), "Error: data of bits requires a count."),
         ((*RIGHT[:2], "70000", *RIGHT[3:]), "Error: ADDRESS is '70000', allowed: 0 to 65535"),
         (
             (*RIGHT[:2], "0xg", *RIGHT[3:]),
@@ -232,10 +179,6 @@ RIGHT = ("127.0.0.1:9000", "coils", "0", "1", "--unit", "1")
         (("a..b:9000", *RIGHT[1:]), "Error: 'a..b' is not a host name."),
         ((*RIGHT, "--timeout", "0"), "Error: Invalid value for '--timeout': '0' is not a time"),
         ((*RIGHT[:4], "--unit", "65536"), "Error: Invalid value for '--unit': 65536 is outside 0"),
-        (
-            (*RIGHT[:3], "--file", "no", "--unit", "1"),
-            "Error: Invalid value for '--file': 'no': No",
-        ),
     ],
 )
 def test_wrong_usage_is_explained(arguments: tuple[str, ...], told: str) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 import sys
-from typing import IO
 
 import click
 
@@ -16,12 +14,6 @@ from holdfast.cli.options.option import flag, json_option, option, whole_number
 from holdfast.cli.terminal_text import print_json
 from holdfast.client.url import Receiver, parse_receiver
 from holdfast.protocol import MAX_WORD
-
-FILE = click.File(encoding="utf-8")
-BYTE_ORDER_MARK = "\ufeff"
-"""Some programs begin a text with it. The encoding `utf-8-sig` would rename standard input."""
-SEPARATORS = re.compile(r"[\s,;]+")
-"""Separators between values in a file."""
 
 
 def _integer(text: str) -> int:
@@ -62,13 +54,10 @@ def _receiver(text: str) -> Receiver:
     epilog="Example: holdfast raw-send 127.0.0.1:9000 input_registers 0 100 200 0x12C --unit 1"
 )
 @click.argument("receiver", metavar="HOST:PORT", type=_receiver)
-@words_argument("ITEM [VALUE]...", required=True)
+@words_argument("ITEM VALUE...", required=True)
 @option("--unit", "N", "Unit id; selects format v1.", _word)
 @option("--memory-id", "N", "Memory id; selects format crc.", _word)
 @flag("--no-crc", "With --memory-id: omit the CRC, for a listener with `compat: {crc: none}`.")
-@option("--file", "FILE", "Read the values from a file; -: standard input.", FILE)
-@option("--hex payload", "BYTES", "Payload as on the wire, in hex.")
-@option("--count", "N", "Number of bits in --hex.", _word)
 @timeout_option(
     f"{raw_ingest.TIMEOUT_S:g}",
     "Time limit for connection, packet and reply together.",
@@ -81,9 +70,6 @@ def raw_send(
     unit: int | None,
     memory_id: int | None,
     no_crc: bool,
-    file: IO[str] | None,
-    payload: str | None,
-    count: int | None,
     timeout: float,
     dry_run: bool,
     as_json: bool,
@@ -92,8 +78,7 @@ def raw_send(
 
     Instead of HOST:PORT, for TLS: raw+tls://host:port?ca=ca.pem&cert=own.pem&key=own.key
 
-    ITEM is hr:0, hr 0, 40001, 4x0001 or %MW0, in any area. Numbers are decimal or 0x. Values in a
-    file are separated by line ends, spaces, commas or semicolons.
+    ITEM is hr:0, hr 0, 40001, 4x0001 or %MW0, in any area. Numbers are decimal or 0x.
 
     Exit codes: 0 written, 1 refused or possibly not written, 2 wrong usage.
     """
@@ -105,17 +90,11 @@ def raw_send(
         raise click.UsageError("Give either --unit (format v1) or --memory-id (format crc).")
     if no_crc and memory_id is None:
         raise click.UsageError("--no-crc requires --memory-id.")
-    if bool(values) + (file is not None) + (payload is not None) != 1:
-        raise click.UsageError("Give exactly one of VALUEs, --file and --hex.")
-    if count is not None and payload is None:
-        raise click.UsageError("--count requires --hex.")
     try:
         packet = raw_ingest.encode(
             area,
             address,
-            None if payload is not None else values if file is None else _values(file),
-            data=None if payload is None else _bytes(payload),
-            count=count,
+            values,
             unit=unit,
             memory_id=memory_id,
             crc="none" if no_crc else None,
@@ -161,30 +140,3 @@ def _reason(error: raw_ingest.RawError) -> str:
     if isinstance(error, raw_ingest.RawTimeout):
         return "timeout"
     return "connection" if isinstance(error.__cause__, OSError) else "failed"
-
-
-def _values(file: IO[str]) -> list[int]:
-    """Reads values from a file. Raises `ValueError` with the line of the first invalid value."""
-    values: list[int] = []
-    try:
-        for line, words in enumerate(file, 1):
-            for text in SEPARATORS.split(words.removeprefix(BYTE_ORDER_MARK).strip()):
-                if not text:
-                    continue
-                value = whole_number(text)
-                if value is None:
-                    found = f"{file.name}:{line}: {text[:40]!r} is not an integer"
-                    raise ValueError(f"{found}, decimal or 0x")
-                values.append(value)
-            if len(values) > MAX_WORD:
-                raise ValueError(f"{file.name} has more than {MAX_WORD} values")
-    except UnicodeDecodeError:
-        raise ValueError(f"{file.name} is not UTF-8 text") from None
-    return values
-
-
-def _bytes(payload: str) -> bytes:
-    try:
-        return bytes.fromhex(payload)
-    except ValueError:
-        raise ValueError(f"--hex is {payload[:40]!r}, allowed: pairs of hex digits") from None
