@@ -206,7 +206,7 @@ def test_a_reader_that_is_gone_is_an_invalid_argument_on_windows(
         (">&-", "describe map {url} --areas hr --range 0-9", 0),
         ("2>&-", "find {url} --units 1", 0),
         ("2>&-", "read {url} hr:0", 0),
-        ("<&-", "token --stdin", 2),
+        ("<&-", "watch {url} hr:0 --times 1", 0),
         ("<&- >&- 2>&-", "describe {url} --units 1 --range 0-9", 0),
     ],
 )

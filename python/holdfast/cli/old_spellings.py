@@ -54,6 +54,7 @@ OLD_OPTIONS: Mapping[str, Mapping[str, str]] = {
 
 GONE = {
     "--modicon": "type the number alone, as in 40001 or 4x0001, or 00001 for a coil",
+    "--stdin": "create an entry, and set its sha256: printf %s SECRET | sha256sum",
 }
 """Options that no command has any more, and what to do instead."""
 
