@@ -22,7 +22,7 @@ PLANT = authority.Authority.create("plant")
 OWNER = authority.new_key("p256")
 GOOD = {
     "CERTIFICATE": authority.pem(PLANT.issue_client("panel", "operator", OWNER, 9)),
-    "X509 CRL": authority.list_pem(PLANT.revocation_list(None, [(7, authority.Reason.superseded)])),
+    "X509 CRL": authority.list_pem(PLANT.revocation_list(None, [7])),
     "PRIVATE KEY": parser.key_pem(OWNER),
 }
 

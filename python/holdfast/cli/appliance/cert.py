@@ -35,18 +35,13 @@ from holdfast.net.certificates.pem import UnusableFile, content, is_locked, pass
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from holdfast.net.certificates.authority import Authority, KeyKind, Reason
+    from holdfast.net.certificates.authority import Authority, KeyKind
     from holdfast.net.certificates.inspection import Described
     from holdfast.net.certificates.parser import PrivateKey
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", re.ASCII)
 """A name of files. Names with other characters could lead out of the folder."""
 
-REASONS = {
-    reason.value: reason
-    for reason in making.Reason
-    if reason.value not in ("certificateHold", "removeFromCRL")
-}
 CRL = "crl.pem"
 RESERVED = ("ca", "crl")
 """Names of the files of the authority and of its revocation list."""
@@ -105,7 +100,6 @@ def cert() -> None:
 
 
 _FOLDER = option("--folder", "FOLDER", "Folder of the files.", FOLDER, ".")
-_COMMON_NAME = option("--common-name", "TEXT", "Name in the certificate.  [default: NAME]")
 _CA = "The authority's certificate.  [default: ca.pem in the folder]"
 _CA_KEY = "The authority's key.  [default: as --ca, with .key]"
 _SECRET = "File that contains the passphrase of the authority's key.  [default: a prompt]"
@@ -173,64 +167,55 @@ def ca(name: str, folder: Path, new: NewKey) -> None:
 @cert.command(epilog="Example: holdfast cert server plc-1 --san 10.0.0.5 --san plc-1.plant.example")
 @click.argument("name")
 @option("--san names", "NAME|ADDRESS", _SAN, multiple=True, required=True)
-@_COMMON_NAME
 @_AUTHORITY
 @_new_key(making.LEAF_DAYS)
 @_reporting
-def server(
-    name: str, names: tuple[str, ...], common_name: str | None, files: AuthorityFiles, new: NewKey
-) -> None:
+def server(name: str, names: tuple[str, ...], files: AuthorityFiles, new: NewKey) -> None:
     """Make the certificate of a server: NAME.pem and NAME.key.
 
     NAME.pem also has the certificates of the authority, as MB-TCP-Security requires.
     """
     _check_name(name)
     alternative = [making.alternative_name(each) for each in names]
-    common = common_name or name
-    _issue(name, files, new, lambda ca, key: ca.issue_server(common, alternative, key, new.days))
+    _issue(name, files, new, lambda ca, key: ca.issue_server(name, alternative, key, new.days))
 
 
 @cert.command(epilog="Example: holdfast cert client panel-7 --role operator")
 @click.argument("name")
 @option("--role", "ROLE", "Role in the certificate, for the rules of listeners.")
-@_COMMON_NAME
 @_AUTHORITY
 @_new_key(making.LEAF_DAYS)
 @_reporting
-def client(
-    name: str, role: str | None, common_name: str | None, files: AuthorityFiles, new: NewKey
-) -> None:
+def client(name: str, role: str | None, files: AuthorityFiles, new: NewKey) -> None:
     """Make the certificate of a client: NAME.pem and NAME.key.
 
     The role is the one of MB-TCP-Security. Without --role, the certificate has the null role, ""
     in rules.
     """
     _check_name(name)
-    common = common_name or name
-    _issue(name, files, new, lambda ca, key: ca.issue_client(common, role, key, new.days))
+    _issue(name, files, new, lambda ca, key: ca.issue_client(name, role, key, new.days))
 
 
-@cert.command(epilog="Example: holdfast cert revoke panel-7.pem --reason keyCompromise")
+@cert.command(epilog="Example: holdfast cert revoke panel-7.pem")
 @click.argument("revoked", nargs=-1, required=True, type=EXISTING_FILE, metavar="CERTIFICATE...")
-@choice("--reason", "Why, for readers of the list.", sorted(REASONS), "unspecified")
 @_AUTHORITY
 @_LIST
 @_reporting
 def revoke(
-    revoked: tuple[Path, ...], reason: str, files: AuthorityFiles, crl_file: Path | None, days: int
+    revoked: tuple[Path, ...], files: AuthorityFiles, crl_file: Path | None, days: int
 ) -> None:
     """Add certificates to the revocation list of their authority: crl.pem.
 
     The first certificate of each file is revoked. Entries stay in the list: do not lose it.
     """
     authority = files.load()
-    entries: list[tuple[int, Reason]] = []
+    serials: list[int] = []
     for file in revoked:
         own = certificates(file)[0]
         if not making.has_signed(authority.certificate, own):
             raise UnusableFile(file, "the authority has not issued this certificate")
-        entries.append((own.serial_number, REASONS[reason]))
-    _write_list(authority, crl_file or files.folder / CRL, days, entries)
+        serials.append(own.serial_number)
+    _write_list(authority, crl_file or files.folder / CRL, days, serials)
 
 
 @cert.command(epilog="Example: holdfast cert crl --days 90")
@@ -299,11 +284,9 @@ def _write(folder: Path, name: str, chain: bytes, key: bytes) -> None:
     click.echo(f"Written: {certificate_file} and {key_file}.")
 
 
-def _write_list(
-    authority: Authority, file: Path, days: int, entries: list[tuple[int, Reason]]
-) -> None:
+def _write_list(authority: Authority, file: Path, days: int, serials: list[int]) -> None:
     before = making.read_revocation_list(file) if file.exists() else None
-    made = authority.revocation_list(before, entries, days)
+    made = authority.revocation_list(before, serials, days)
     pem_files.replace(file, making.list_pem(made))
     count = len(made)
     noun = "1 certificate is" if count == 1 else f"{count} certificates are"

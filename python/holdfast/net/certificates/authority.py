@@ -71,9 +71,6 @@ _USAGES = (
     *("key_agreement", "key_cert_sign", "crl_sign", "encipher_only", "decipher_only"),
 )
 
-Reason = x509.ReasonFlags
-"""Why a certificate was revoked."""
-
 
 class Refused(ValueError):
     """The authority can't issue or revoke this certificate. The message says why."""
@@ -156,7 +153,7 @@ class Authority:
     def revocation_list(
         self,
         before: x509.CertificateRevocationList | None,
-        revoked: Sequence[tuple[int, Reason]] = (),
+        revoked: Sequence[int] = (),
         days: int = CRL_DAYS,
     ) -> x509.CertificateRevocationList:
         """Returns a new list: the entries of the one before, and these serial numbers.
@@ -174,10 +171,11 @@ class Authority:
             for entry in before:
                 known.add(entry.serial_number)
                 builder = builder.add_revoked_certificate(entry)
-        for serial, reason in revoked:
+        for serial in revoked:
             if serial not in known:
                 known.add(serial)
-                builder = builder.add_revoked_certificate(_entry(serial, time, reason))
+                entry = x509.RevokedCertificateBuilder().serial_number(serial)
+                builder = builder.add_revoked_certificate(entry.revocation_date(time).build())
         return (
             builder.add_extension(_issuer_id(self.certificate), critical=False)
             .add_extension(x509.CRLNumber(number), critical=False)
@@ -306,13 +304,6 @@ def _issuer_id(authority: x509.Certificate) -> x509.AuthorityKeyIdentifier:
     except x509.ExtensionNotFound:
         return x509.AuthorityKeyIdentifier.from_issuer_public_key(_signing_key(authority))
     return x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(found.value)
-
-
-def _entry(serial: int, time: datetime, reason: Reason) -> x509.RevokedCertificate:
-    builder = x509.RevokedCertificateBuilder().serial_number(serial).revocation_date(time)
-    if reason != Reason.unspecified:
-        builder = builder.add_extension(x509.CRLReason(reason), critical=False)
-    return builder.build()
 
 
 def _number(of: x509.CertificateRevocationList) -> int:
