@@ -97,13 +97,22 @@ class Bench:
         self.judges = [stack.enter_context(running(judge)) for _ in range(count)]
         self.nats = stack.enter_context(running(common.python("scanner_nats.py")))
         self.url = f"nats://{self.nats.address}"
-        command = [sys.executable, "-m", "holdfast", "scan", "--log-format", "json"]
-        command += ["--max-devices", str(devices), "--max-tags", str(devices * TAGS)]
-        command += ["--nats", self.url, "--fleet", FLEET, "--node"]
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         self.nodes = [
-            stack.enter_context(running([*command, f"n{number}"], listens=False))
+            stack.enter_context(running(self._node(folder, f"n{number}", devices), listens=False))
             for number in range(options.nodes)
         ]
+
+    def _node(self, folder: Path, name: str, devices: int) -> list[str]:
+        nats = {
+            "servers": [self.url],
+            "devices": ["127.0.0.0/8"],
+            "limits": {"devices": devices, "tags": devices * TAGS},
+            "fleet": {"name": FLEET, "node": name},
+        }
+        file = folder / f"{name}.yaml"
+        file.write_text(json.dumps({"nats": nats, "log": {"format": "json"}}))
+        return [sys.executable, "-m", "holdfast", "run", str(file)]
 
     def judged(self) -> dict[str, Any]:
         """Returns what the devices have noted since the last call."""

@@ -33,11 +33,8 @@ from holdfast.config.fingerprint import fingerprint
 from holdfast.config.values.scanner_settings import (
     MAX_DEADBAND,
     MAX_PARTITIONS,
-    MAX_PING_INTERVAL,
-    MAX_PINGS,
     MAX_SCAN_RATE,
     MAX_TIMEOUT,
-    MIN_PING_INTERVAL,
     MIN_SCAN_RATE,
     MIN_TIMEOUT,
     PARTITIONS,
@@ -57,8 +54,7 @@ from holdfast.events import log_lines
 from holdfast.events.writer import announce
 from holdfast.net import event_loop
 from holdfast.net.allow_list import AllowedNetwork
-from holdfast.net.nats.connection import Ping, Servers
-from holdfast.net.nats.pings import PING_INTERVAL_S, PINGS_OUTSTANDING
+from holdfast.net.nats.connection import Servers
 from holdfast.net.nats_server import HOST, ServerUnusable, TemporaryServer
 from holdfast.runtime.bounded_files import FileWork
 from holdfast.runtime.interpreter import freeze_garbage_collector
@@ -99,12 +95,10 @@ class _Timeout(Duration):
 FOLDER = click.Path(file_okay=False, path_type=Path)
 TIMEOUTS = _Timeout(MIN_TIMEOUT / 1000, MAX_TIMEOUT / 1000)
 INTERVALS = Duration(MIN_SCAN_RATE / 1000, MAX_SCAN_RATE / 1000)
-PINGS = Duration(MIN_PING_INTERVAL, MAX_PING_INTERVAL)
 _ALLOW = """Devices that subscribers may poll: a network, an address or a serial device; repeatable.
 Without a network: private and loopback addresses."""
 _WRITES = "Tags that may be written: all not declared read-only, those declared writable, or none."
 _DEADBAND = "Default: minimum change of a number, with --publish change."
-_OUTSTANDING = "Pings without an answer before a reconnect."
 _KEEP = "Keep subscriptions in JetStream, and restore them after a restart."
 _PARTITIONS = "Parts of the devices in a fleet: 20 times the number of scanners, or more."
 
@@ -122,16 +116,12 @@ _PARTITIONS = "Parts of the devices in a fleet: 20 times the number of scanners,
 @option("--deadband", "NUMBER", _DEADBAND, DecimalNumber(0, MAX_DEADBAND), 0.0)
 @time_option("--every", "Default interval between scans.", f"{SCAN_RATE}ms", INTERVALS)
 @flag("--strict", "Refuse requests with unknown keys or inexact values, instead of adjusting them.")
-@time_option("--ping-interval", "Interval of pings to NATS.", f"{PING_INTERVAL_S:g}", PINGS)
-@number_option("--ping-outstanding", _OUTSTANDING, 1, MAX_PINGS, PINGS_OUTSTANDING)
 @flag("--publish-logs/--no-publish-logs", "Publish the log on service.logs.modbus.PREFIX.", True)
 @flag("--keep-subscriptions/--no-keep-subscriptions", _KEEP, True)
 @option("--fleet", "NAME", "Share devices with scanners of this fleet.", parsed_by(parse_member))
 @option("--node", "NAME", "Name of this scanner in the fleet; unique.", parsed_by(parse_member))
 @number_option("--partitions", _PARTITIONS, 1, MAX_PARTITIONS, PARTITIONS)
 @tls_options("device", "device_tls", DEVICES, " for devices")
-@number_option("--max-devices", "Devices of all subscribers.", default=ScannerLimits.devices)
-@number_option("--max-tags", "Tags of all devices.", default=ScannerLimits.tags)
 @log_level_option
 @log_format_option
 @schema_option("Print the JSON Schema of all messages and exit.", json_schema)
@@ -156,8 +146,7 @@ def scan(
     if store is not None and not embedded:
         raise click.UsageError("--store requires --embedded.")
     log_lines.configure(options["log_level"], options["log_format"])
-    limits = ScannerLimits(devices=options["max_devices"], tags=options["max_tags"])
-    raise_open_file_limit(limits.devices)
+    raise_open_file_limit(ScannerLimits.devices)
     with ExitStack() as stack:
         check: Callable[[], None] | None = None
         try:
@@ -165,7 +154,7 @@ def scan(
             if embedded:
                 server = stack.enter_context(TemporaryServer(_embedded_port(servers), store))
                 servers, check = Servers((server.url,)), server.check
-            settings = _settings(options, servers, allow, limits, device_tls)
+            settings = _settings(options, servers, allow, device_tls)
             announce(_greeting(settings))
             event_loop.run(_serve(settings, check))
         except FleetRefused as refused:
@@ -190,15 +179,13 @@ def _settings(
     options: dict[str, Any],
     servers: Servers,
     allow: tuple[AllowEntry, ...],
-    limits: ScannerLimits,
     trust: Tls,
 ) -> Settings:
     return Settings(
         servers,
         options["prefix"],
         allow,
-        limits,
-        trust,
+        device_tls=trust,
         defaults=Defaults(
             round(options["timeout"] * 1000),
             options["publish"],
@@ -207,7 +194,6 @@ def _settings(
         ),
         writes=options["writes"],
         strict=options["strict"],
-        ping=Ping(options["ping_interval"], options["ping_outstanding"]),
         publish_logs=options["publish_logs"],
         keep_subscriptions=options["keep_subscriptions"],
         dialect=options["dialect"],
