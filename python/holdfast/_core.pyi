@@ -585,9 +585,9 @@ class ServerTls:
     """Settings of a TLS server with mutual authentication. Reads the PEM files at once.
 
     `ca_file` has the authorities of client certificates, and clients' own certificates;
-    `crl_file` has the revocation lists of these authorities, and `expired_crl` is what happens to
-    their clients after `nextUpdate`. `decrypted_key` is the content of `key_file` without its
-    passphrase, if it has one. Raises `ValueError` for a file that can't be used.
+    `crl_file` has the revocation lists of these authorities. `decrypted_key` is the content of
+    `key_file` without its passphrase, if it has one. Raises `ValueError` for a file that can't be
+    used.
     """
 
     def __new__(
@@ -597,7 +597,6 @@ class ServerTls:
         key_file: str | PathLike[str],
         ca_file: str | PathLike[str],
         crl_file: str | PathLike[str] | None = None,
-        expired_crl: Literal["refuse", "accept"] = "refuse",
         decrypted_key: bytes | None = None,
     ) -> ServerTls: ...
     @property
@@ -741,7 +740,6 @@ def https_server_tls(
     key_file: str | PathLike[str],
     client_ca_file: str | PathLike[str] | None = None,
     crl_file: str | PathLike[str] | None = None,
-    expired_crl: Literal["refuse", "accept"] = "refuse",
     roles: Sequence[str] | None = None,
     decrypted_key: bytes | None = None,
 ) -> ServerTls:

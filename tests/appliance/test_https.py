@@ -208,8 +208,8 @@ def test_revocation_lists_and_roles_need_authorities(files: Files, tmp_path: Pat
 def test_the_settings_of_client_certificates_are_checked(files: Files, tmp_path: Path) -> None:
     ca = {"client_ca_file": str(files.authority.ca)}
     file = configured(tmp_path, {**files.tls(), **ca, "expired_crl": "accept"})
-    told = "rest.tls.expired_crl: has no effect without crl_file"
-    assert checked(file) == (0, [f"warning: {file}:1: {told}"])
+    code, [line, _] = checked(file)
+    assert (code, "rest.tls.expired_crl: removed, clients are refused after" in line) == (2, True)
     file = configured(tmp_path, {**files.tls(), **ca, "roles": ["a", "b", "a"]})
     code, [line, _] = checked(file)
     assert (code, "rest.tls.roles" in line) == (2, True)

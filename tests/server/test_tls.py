@@ -288,7 +288,7 @@ def test_a_listener_without_authorities_for_clients_is_no_listener(
     whole = configuration(party.files(), ANYONE)
     entry = f'"ca_file": "{party.authority.ca}"'
     file = tmp_path / "plant.yaml"
-    for instead in ('"ca_file": null', '"expired_crl": "warn"'):
+    for instead in ('"ca_file": null', '"review": 0'):
         assert entry in whole
         file.write_text(whole.replace(entry, instead))
         with pytest.raises(ConfigError, match=r"listeners\.secure\.tls.*ca_file"):

@@ -130,16 +130,6 @@ def test_a_list_that_has_expired_is_doubtful_and_refuses_clients(
     assert reasons(appliance, caplog) == ["expired_revocation_list"]
 
 
-def test_a_list_that_has_expired_may_be_accepted(plant: Plant, run: Run) -> None:
-    lost = plant.authority.issue("lost", "DNS:lost")
-    files = {"crl_file": plant.authority.revoke(lost, dates=PAST), "expired_crl": "accept"}
-    [warning] = plant.warnings(**files)
-    assert warning.endswith(" days ago: certificates revoked since are accepted")
-    appliance = run(plant.config(**files).read_text())
-    assert verdict(appliance, plant.trust()) == "served"
-    assert "REVOKED" in verdict(appliance, context(plant.authority.ca, lost))
-
-
 def test_the_newest_list_of_an_authority_counts(plant: Plant, run: Run) -> None:
     old = plant.joined("old.crl", plant.authority.revoke(dates=PAST))
     both = plant.joined("both.crl", old, plant.authority.revoke())
@@ -289,11 +279,6 @@ def test_check_prints_warnings_and_succeeds(plant: Plant) -> None:
     [line] = [line for line in result.stderr.splitlines() if "warning" in line]
     assert line.startswith(f"warning: {file}:")
     assert "listeners.secure.tls: " in line
-
-
-def test_a_policy_without_lists_has_no_effect(plant: Plant) -> None:
-    [warning] = load_whole(plant.config(expired_crl="accept")).warnings
-    assert warning.message == "has no effect without crl_file"
 
 
 def test_a_file_that_does_not_answer_stops_no_other_thread(tmp_path: Path) -> None:

@@ -360,14 +360,10 @@ def test_a_session_is_resumed_with_the_certificate_of_the_client(
         assert web.answers(peer.rest())[0].status == 200
 
 
-def test_expired_revocation_lists_may_be_accepted(
+def test_clients_are_refused_after_the_end_of_their_list(
     start: Start, files: Files, log: web.Records
 ) -> None:
-    gone = files.authority.issue("gone", CLIENT)
-    lists = files.authority.revoke(gone, dates=PAST)
-    service = start(files.mutual(crl_file=lists, expired_crl="accept"))
-    assert is_served(service, files.trust(files.client))
-    assert refusal(service, files.trust(gone), log) == "revoked"
+    lists = files.authority.revoke(dates=PAST)
     service = start(files.mutual(crl_file=lists))
     assert refusal(service, files.trust(files.client), log) == "expired_revocation_list"
 

@@ -3,20 +3,16 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use holdfast_engine::tls::server::{
-    ExpiredLists, Protocol, ServerFiles, ServerTls as CoreServerTls,
-};
+use holdfast_engine::tls::server::{Protocol, ServerFiles, ServerTls as CoreServerTls};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-
-use crate::arguments::word;
 
 /// Settings of a TLS server with mutual authentication. Reads the PEM files at once.
 ///
 /// `ca_file` has the authorities of client certificates, and clients' own certificates;
-/// `crl_file` has the revocation lists of these authorities, and `expired_crl` is what happens to
-/// their clients after `nextUpdate`. `decrypted_key` is the content of `key_file` without its
-/// passphrase, if it has one. Raises `ValueError` for a file that can't be used.
+/// `crl_file` has the revocation lists of these authorities. `decrypted_key` is the content of
+/// `key_file` without its passphrase, if it has one. Raises `ValueError` for a file that can't be
+/// used.
 #[pyclass(frozen, module = "holdfast")]
 pub struct ServerTls {
     pub(crate) core: Arc<CoreServerTls>,
@@ -25,14 +21,13 @@ pub struct ServerTls {
 #[pymethods]
 impl ServerTls {
     #[new]
-    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, expired_crl="refuse", decrypted_key=None))]
+    #[pyo3(signature = (*, cert_file, key_file, ca_file, crl_file=None, decrypted_key=None))]
     fn new(
         py: Python<'_>,
         cert_file: PathBuf,
         key_file: PathBuf,
         ca_file: PathBuf,
         crl_file: Option<PathBuf>,
-        expired_crl: &str,
         decrypted_key: Option<&[u8]>,
     ) -> PyResult<ServerTls> {
         let files = ServerFiles {
@@ -41,7 +36,6 @@ impl ServerTls {
             key_file,
             ca_file: Some(ca_file),
             crl_file,
-            expired_lists: expired_lists(expired_crl)?,
             roles: None,
         };
         load(py, &files, decrypted_key)
@@ -60,7 +54,7 @@ impl ServerTls {
 /// certificates: "" is a certificate without a role, `None` is any role. The rest is that of
 /// `ServerTls`, also what it raises.
 #[pyfunction]
-#[pyo3(signature = (*, cert_file, key_file, client_ca_file=None, crl_file=None, expired_crl="refuse", roles=None, decrypted_key=None))]
+#[pyo3(signature = (*, cert_file, key_file, client_ca_file=None, crl_file=None, roles=None, decrypted_key=None))]
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 pub fn https_server_tls(
     py: Python<'_>,
@@ -68,7 +62,6 @@ pub fn https_server_tls(
     key_file: PathBuf,
     client_ca_file: Option<PathBuf>,
     crl_file: Option<PathBuf>,
-    expired_crl: &str,
     roles: Option<Vec<String>>,
     decrypted_key: Option<&[u8]>,
 ) -> PyResult<ServerTls> {
@@ -78,7 +71,6 @@ pub fn https_server_tls(
         key_file,
         ca_file: client_ca_file,
         crl_file,
-        expired_lists: expired_lists(expired_crl)?,
         roles,
     };
     load(py, &files, decrypted_key)
@@ -95,11 +87,6 @@ impl ServerTls {
             Protocol::Modbus => "tls is that of an HTTPS server, allowed: ServerTls(cert_file=…)",
         }))
     }
-}
-
-fn expired_lists(text: &str) -> PyResult<ExpiredLists> {
-    let allowed = [("refuse", ExpiredLists::Refuse), ("accept", ExpiredLists::Accept)];
-    word("expired_crl", text, &allowed)
 }
 
 fn load(py: Python<'_>, files: &ServerFiles, decrypted_key: Option<&[u8]>) -> PyResult<ServerTls> {

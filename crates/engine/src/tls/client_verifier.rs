@@ -53,7 +53,7 @@ impl Clients {
             Some(file) => List::of_file(file)?,
             None => Vec::new(),
         };
-        let trust = Trust::new(listed, Lists { lists, expired: files.expired_lists });
+        let trust = Trust::new(listed, Lists { lists });
         if let Some(file) = &files.crl_file {
             doubts.of_lists(file, &trust);
         }

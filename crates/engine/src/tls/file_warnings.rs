@@ -8,7 +8,7 @@ use rustls::pki_types::{CertificateDer, UnixTime};
 use super::certificate::{Parsed, name_text};
 use super::failure::{between, span};
 use super::revocation::List;
-use super::server_files::{ExpiredLists, ServerFiles};
+use super::server_files::ServerFiles;
 use super::verification::{Listed, Trust};
 
 /// Finds what is doubtful.
@@ -143,11 +143,10 @@ impl<'f> Doubts<'f> {
             && self.now > ends
         {
             let ago = span(between(ends, self.now));
-            let outcome = match self.files.expired_lists {
-                ExpiredLists::Refuse => "clients of that authority are refused",
-                ExpiredLists::Accept => "certificates revoked since are accepted",
-            };
-            self.add(file, &format!("{name} expired {ago} ago: {outcome}"));
+            self.add(
+                file,
+                &format!("{name} expired {ago} ago: clients of that authority are refused"),
+            );
         }
         if self.now < list.begins() {
             let wait = span(between(self.now, list.begins()));

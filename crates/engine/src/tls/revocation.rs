@@ -21,7 +21,6 @@ use x509_cert::time::Time;
 
 use super::certificate::{AnySerial, Parsed};
 use super::files::FileError;
-use super::server_files::ExpiredLists;
 
 /// The extensions that RFC 5280, 5.2 requires of every list. No judgement depends on them.
 const REQUIRED: [(ObjectIdentifier, &str); 2] =
@@ -191,7 +190,6 @@ impl List {
 #[derive(Debug, Default)]
 pub(super) struct Lists {
     pub(super) lists: Vec<List>,
-    pub(super) expired: ExpiredLists,
 }
 
 impl Lists {
@@ -297,9 +295,7 @@ impl Lists {
         presented: Option<&Parsed>,
         now: UnixTime,
     ) -> Result<(), webpki::Error> {
-        if self.expired == ExpiredLists::Refuse
-            && let Some(next_update) = list.ends().filter(|ends| now >= *ends)
-        {
+        if let Some(next_update) = list.ends().filter(|ends| now >= *ends) {
             return Err(webpki::Error::CrlExpired { time: now, next_update });
         }
         if presented.is_some_and(|issuer| !issuer.may_sign_lists()) {
@@ -460,7 +456,7 @@ mod tests {
     fn judged_as_der(listed: Vec<&[u8]>, lists: &[Vec<u8>], chain: Vec<&[u8]>) -> &'static str {
         let lists = lists.iter().map(|der| List::new(der, 1).unwrap()).collect();
         let listed = listed.iter().map(|der| Listed::new(CertificateDer::from(der.to_vec())));
-        let lists = Lists { lists, expired: ExpiredLists::Refuse };
+        let lists = Lists { lists };
         let trust = Trust::new(listed.collect::<Result<_, _>>().unwrap(), lists);
         let chain: Vec<_> = chain.into_iter().map(CertificateDer::from).collect();
         match trust.judge(&chain[0], &chain[1..], Purpose::Client, NOW) {
@@ -808,7 +804,7 @@ mod tests {
         let der = leaf.certificate.der();
         let trusts = |bytes: &[u8]| {
             let Ok(list) = List::new(bytes, 1) else { return false };
-            let lists = Lists { lists: vec![list], expired: ExpiredLists::Refuse };
+            let lists = Lists { lists: vec![list] };
             let trust = Trust::new(Arc::clone(&listed) as _, lists);
             trust.judge(der, &[], Purpose::Client, NOW).is_ok()
         };

@@ -20,7 +20,7 @@ use super::handshake_notes::Notes;
 use super::hello::{Hello, LENGTHS, RECORD_HEADER_LEN};
 use super::own_certificate::own;
 use super::provider::provider;
-pub use super::server_files::{ExpiredLists, Protocol, ServerFiles};
+pub use super::server_files::{Protocol, ServerFiles};
 use super::sessions::Sessions;
 use super::{Channel, TlsFailure};
 

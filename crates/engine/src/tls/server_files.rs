@@ -15,7 +15,6 @@ pub struct ServerFiles {
     pub ca_file: Option<PathBuf>,
     /// Revocation lists. If given, every authority above a client requires a list.
     pub crl_file: Option<PathBuf>,
-    pub expired_lists: ExpiredLists,
     /// The allowed roles of clients, "" is the null role; `None` is any role. For Modbus, the rules
     /// of a listener decide instead.
     pub roles: Option<Vec<String>>,
@@ -46,14 +45,4 @@ impl Protocol {
             Protocol::Http => "client_ca_file",
         }
     }
-}
-
-/// What happens to clients of an authority whose revocation list is past its `nextUpdate`.
-#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
-pub enum ExpiredLists {
-    /// They are refused.
-    #[default]
-    Refuse,
-    /// The list counts as it is.
-    Accept,
 }

@@ -18,7 +18,7 @@ use rustls::{
 };
 
 use super::provider::provider;
-use super::server_files::{ExpiredLists, Protocol, ServerFiles};
+use super::server_files::{Protocol, ServerFiles};
 
 /// A certificate and its key.
 pub(crate) struct Owner {
@@ -160,7 +160,6 @@ impl Party {
             key_file: write("server.key", self.server.key.serialize_pem()),
             ca_file: Some(write("ca.pem", self.authority.pem())),
             crl_file: None,
-            expired_lists: ExpiredLists::Refuse,
             roles: None,
         }
     }

@@ -160,7 +160,6 @@ def server_tls(settings: ServerTlsConfig) -> _core.ServerTls:
         key_file=settings.key_file,
         ca_file=settings.ca_file,
         crl_file=settings.crl_file,
-        expired_crl=settings.expired_crl,
         decrypted_key=key_for_core(settings.key_file, settings.key_passphrase_file, *others),
     )
 

@@ -40,6 +40,11 @@ FORMER: dict[str, str | Callable[[str, object], str]] = {
         ("listeners.<modbus-rtu>.rules.*.sources", "listeners.<modbus-ascii>.rules.*.sources"),
         "not allowed on a serial line, allowed: units, access, functions, deny",
     ),
+    **dict.fromkeys(
+        ("listeners.*.tls.expired_crl", "*.tls.expired_crl"),
+        "removed, clients are refused after the nextUpdate of a list: delete the key, and fetch a "
+        "list with a later nextUpdate for crl_file",
+    ),
     "listeners.*.max_handshakes": "removed, it is max_connections, at least 256: delete the key",
     "listeners.<modbus-rtu>.serial.data_bits": "removed, RTU has 8 data bits: delete the key",
     "devices.*.cost": "removed, allowed: max_gap: auto, which measures the device, or max_gap: N "

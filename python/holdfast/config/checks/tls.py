@@ -45,8 +45,6 @@ def check_client_tls(path: KeyPath, tls: ClientTlsConfig | None, report: Report)
 def check_server_tls(path: KeyPath, tls: ServerTlsConfig | HttpsConfig, report: Report) -> None:
     """Reports files of a TLS or HTTPS server that can't be read. The model reports missing keys."""
     check_files(path, tls, SERVER_FILES, report)
-    if given(tls, "expired_crl") and not given(tls, "crl_file"):
-        report.warn((*path, "expired_crl"), "has no effect without crl_file")
 
 
 def check_https(path: KeyPath, tls: HttpsConfig | None, report: Report) -> None:

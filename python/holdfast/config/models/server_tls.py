@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated
 
 from holdfast.config.models.base import Model
 from holdfast.config.values.scalars import DurationOrZero, FilePath, NotNull, Roles
 from holdfast.net.certificates.own import REVIEW_S
-
-ExpiredLists: TypeAlias = Literal["refuse", "accept"]
 
 
 class _ServerFiles(Model):
@@ -29,8 +27,6 @@ class ServerTlsConfig(_ServerFiles):
     """Authorities of client certificates, and clients' own certificates."""
     crl_file: Annotated[FilePath | None, NotNull()] = None
     """Certificate revocation lists: one of each authority in the chain of a client."""
-    expired_crl: ExpiredLists = "refuse"
-    """Clients of an authority whose list is past its nextUpdate."""
     review: DurationOrZero = REVIEW_S
     """At most so many seconds pass until the certificates of open connections are judged again; 0:
     only at a reload."""
@@ -45,8 +41,6 @@ class HttpsConfig(_ServerFiles):
     crl_file: Annotated[FilePath | None, NotNull()] = None
     """Certificate revocation lists: one of each authority in the chain of a client; requires
     client_ca_file."""
-    expired_crl: ExpiredLists = "refuse"
-    """Clients of an authority whose list is past its nextUpdate."""
     review: DurationOrZero = REVIEW_S
     """At most so many seconds pass until the certificates of open connections are judged again; 0:
     only at a reload."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from holdfast import _core
 from holdfast.net.certificates.own import REVIEW_S, key_for_core
@@ -26,8 +26,6 @@ class HttpsFiles:
     """If given, clients need a certificate that these certificates vouch for."""
     crl_file: Path | None = None
     """If given, every authority above a client requires a list."""
-    expired_crl: Literal["refuse", "accept"] = "refuse"
-    """Clients of an authority whose list is past its `nextUpdate`."""
     review: float = REVIEW_S
     """Seconds after which the certificates of open connections are judged again; 0: never."""
     roles: Sequence[str] | None = None
@@ -75,7 +73,6 @@ def _loaded(files: HttpsFiles) -> _core.ServerTls:
             key_file=files.key_file,
             client_ca_file=files.client_ca_file,
             crl_file=files.crl_file,
-            expired_crl=files.expired_crl,
             roles=files.roles,
             decrypted_key=decrypted_key,
         )
