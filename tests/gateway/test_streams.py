@@ -229,7 +229,6 @@ def test_a_map_tells_the_ranges_of_all_areas(gateway: Running, serve: Serve) -> 
     assert last.name == "result"
     assert last.data["success"] is True
     assert (last.data["first"], last.data["last"], last.data["exact"]) == (0, 65535, False)
-    assert last.data["step"] == 256
     assert last.data["requests"] == sum(area["requests"] for area in last.data["areas"])
     assert ranges(last.data) == {
         "coils": [[0, 16]],
@@ -276,7 +275,6 @@ def test_a_map_can_be_of_a_part_and_exact(gateway: Running, serve: Serve) -> Non
     result = mapped(gateway, serve({1: plant}).address[1], **options).next("result")
     assert ranges(result) == {"holding_registers": [[37, 38]]}
     assert (result["exact"], result["first"], result["last"]) == (True, 30, 45)
-    assert result["step"] is None
 
 
 def test_what_fails_otherwise_is_told_apart(gateway: Running) -> None:

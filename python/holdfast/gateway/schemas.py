@@ -166,11 +166,6 @@ _MAPS: dict[str, Schema] = {
             "requests": COUNT,
             "seconds": NUMBER,
             "exact": BOOLEAN,
-            "step": {
-                "type": ["integer", "null"],
-                "description": "The largest distance of two samples. Addresses where ranges often "
-                "begin were read too. `null` if every address was read",
-            },
             "first": ADDRESS_SCHEMA,
             "last": ADDRESS_SCHEMA,
             "areas": array_of(_MAPPED_AREA),

@@ -58,7 +58,7 @@ def map_(
 
     Without --exact, reads samples: the first 16, multiples of 10 below 10000 and of 100 above, the
     addresses after them (101, 1001), multiples of 10 from 30000 and 40000 to 1000 addresses later,
-    every 256th address (--step); then the whole range around each existing sample. All reported
+    every 256th address; then the whole range around each existing sample. All reported
     addresses were read. A range without a sample is missed. This takes about 2200 requests per
     area, more for large ranges. With --sparse, about 600: samples are 50 apart below 10000, 256
     above, and short ranges are missed more often.

@@ -10,7 +10,6 @@ from holdfast.cli.options import item
 from holdfast.cli.options.duration import delay_option
 from holdfast.cli.options.item import areas_of
 from holdfast.cli.options.option import flag, number_option, option, option_group
-from holdfast.discovery import address_search
 from holdfast.discovery.address_search import Survey
 from holdfast.protocol import LAST_ADDRESS
 from holdfast.types import AREAS, Area
@@ -27,7 +26,6 @@ class Settings:
     exact: bool
     sparse: bool
     max_quantity: int | None
-    step: int
     span: range
     max_requests: int | None
     delay: float
@@ -46,7 +44,6 @@ survey_options = option_group(
     flag("--exact", "Read every address instead of samples."),
     flag("--sparse", "Read a quarter of the samples."),
     number_option("--max-quantity", "Read at most N bits or registers per request."),
-    number_option("--step", "Distance between samples.", default=address_search.STEP),
     option("--range span", "FIRST-LAST", "Addresses to search.", _span, f"0-{LAST_ADDRESS}"),
     number_option("--max-requests", _LIMIT),
     delay_option,
@@ -63,7 +60,6 @@ def planned(settings: Settings) -> Survey:
         settings.areas or AREAS,
         exact=settings.exact,
         max_quantity=settings.max_quantity,
-        step=settings.step,
         span=settings.span,
         dense=not settings.sparse,
         max_requests=limit,

@@ -15,7 +15,7 @@ from holdfast.gateway.fields import ADDRESS_SCHEMA, AREA_LIST, MAP_READ_TIMEOUT_
 from holdfast.net.http.fields import Field, malformed
 from holdfast.net.http.requests import BadRequest
 from holdfast.net.http.schemas import BOOLEAN, integer
-from holdfast.protocol import ADDRESSES, LAST_ADDRESS, READ_BITS
+from holdfast.protocol import LAST_ADDRESS, READ_BITS
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
@@ -49,9 +49,6 @@ def fields(limits: GatewayLimits) -> tuple[Field, ...]:
         Field("first", ADDRESS_SCHEMA, "The first address to map", 0),
         Field("last", ADDRESS_SCHEMA, "The last address to map", LAST_ADDRESS),
         Field("exact", BOOLEAN, "Read every address instead of samples", False),
-        Field(
-            "step", integer(1, ADDRESSES), "Largest distance of two samples", address_search.STEP
-        ),
         Field("maxQuantity", integer(1, READ_BITS), "Largest quantity of one read", None),
         Field(
             "maxStreams",
@@ -71,7 +68,6 @@ def _planned(given: Given) -> Survey:
         given["areas"] or AREAS,
         exact=given["exact"],
         max_quantity=given["maxQuantity"],
-        step=given["step"],
         span=range(given["first"], given["last"] + 1),
     )
 
@@ -95,7 +91,6 @@ async def survey(given: Given, device: RequestedDevice, stream: Stream, longest:
         running.cancel()
         await asyncio.wait([running])
     result = {**_result(survey, failure), "seconds": round(time.monotonic() - began, 3)}
-    result["step"] = None if survey.exact else given["step"]
     await stream.event("result", result)
     await stream.end()
 
