@@ -52,7 +52,7 @@ def test_tls_with_the_roles_of_certificates(tmp_path: Path, memory: holdfast.Mem
     rule = holdfast.Rule(
         {1: memory}, sources=["127.0.0.1"], access="read-write", roles=["operator"]
     )
-    with holdfast.Server(rules=[rule], bind="tls://127.0.0.1:0", tls=tls, max_handshakes=4) as it:
+    with holdfast.Server(rules=[rule], bind="tls://127.0.0.1:0", tls=tls) as it:
         files = f"ca={authority.ca}&cert={peer.certificate}&key={peer.key}"
         exchange(f"tls://127.0.0.1:{it.address[1]}?{files}", memory)
 
@@ -75,7 +75,6 @@ def test_a_serial_line(mode: str, tmp_path: Path, memory: holdfast.Memory) -> No
         ("tcp://127.0.0.1:0?unit=1", {}, "allowed: 127.0.0.1:5020, tcp://"),
         ("tcp://localhost:0", {}, "localhost"),
         ("tls://127.0.0.1:0", {}, "tls:// requires tls, the certificates"),
-        ("tcp://127.0.0.1:0", {"max_handshakes": 4}, "max_handshakes has no effect with tcp"),
         ("udp://127.0.0.1:0", {"max_connections": 4}, "max_connections has no effect with udp"),
         ("rtu+udp://127.0.0.1:0", {"idle_timeout": 4}, "idle_timeout has no effect with rtu+udp"),
         ("tcp://127.0.0.1:0", {"frame_timeout": 1}, "frame_timeout has no effect with tcp"),

@@ -36,14 +36,14 @@ class ServerOptions(TypedDict, total=False):
     """Function 12 answers with the latest events of this server."""
     tls: ServerTls | None
     """The certificates; `None` is plain TCP."""
-    max_handshakes: int
-    """With TLS: the most connections that are not authenticated yet, beside `max_connections`."""
 
 
 class StreamOptions(ServerOptions):
     """A listener for Modbus over connections."""
 
     framing: Literal["mbap", "rtu", "ascii"]
+    max_handshakes: int
+    """With TLS: the most connections that are not authenticated yet, beside `max_connections`."""
     raw_ingest: Listener | None
     """Packets on the same port, with `mbap` and without TLS; its bind and limits are ignored."""
 
@@ -103,10 +103,14 @@ DEFAULTS: ServerOptions = {
     "listen_only": False,
     "event_log": False,
     "tls": None,
-    "max_handshakes": 256,
 }
 
-STREAM_DEFAULTS: StreamOptions = {**DEFAULTS, "framing": "mbap", "raw_ingest": None}
+STREAM_DEFAULTS: StreamOptions = {
+    **DEFAULTS,
+    "framing": "mbap",
+    "max_handshakes": 256,
+    "raw_ingest": None,
+}
 
 RAW_INGEST_DEFAULTS: RawIngestOptions = {
     "format": "v1",

@@ -235,7 +235,7 @@ def _check(scheme: str, options: ServerOptions) -> None:
     elif scheme in _DATAGRAMS:
         allowed = {"listen_only", "event_log"}
     else:
-        special = {"frame_timeout": "rtu+tcp", "tls": "tls", "max_handshakes": "tls"}
+        special = {"frame_timeout": "rtu+tcp", "tls": "tls"}
         allowed = {name for name in DEFAULTS if special.get(name, scheme) == scheme}
     for name, value in options.items():
         if name not in DEFAULTS:

@@ -40,7 +40,7 @@ from holdfast.config.values.scalars import (
 )
 from holdfast.protocol import LAST_ADDRESS
 from holdfast.runtime.suggestion import suggestion
-from holdfast.server.options import DEFAULTS
+from holdfast.server.options import DEFAULTS, STREAM_DEFAULTS
 from holdfast.types import Access, BitArea
 
 FunctionList: TypeAlias = Annotated[Annotated[Codes, Field(min_length=1)] | None, NotNull()]
@@ -223,7 +223,7 @@ def _handshakes(max_connections: int) -> int:
     A listener for few clients has room for strangers too, who must not displace a client's
     handshake.
     """
-    return max(DEFAULTS["max_handshakes"], max_connections)
+    return max(STREAM_DEFAULTS["max_handshakes"], max_connections)
 
 
 class RawCompatConfig(Model):
