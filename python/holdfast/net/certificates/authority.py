@@ -174,8 +174,8 @@ class Authority:
         for serial in revoked:
             if serial not in known:
                 known.add(serial)
-                entry = x509.RevokedCertificateBuilder().serial_number(serial)
-                builder = builder.add_revoked_certificate(entry.revocation_date(time).build())
+                new = x509.RevokedCertificateBuilder().serial_number(serial)
+                builder = builder.add_revoked_certificate(new.revocation_date(time).build())
         return (
             builder.add_extension(_issuer_id(self.certificate), critical=False)
             .add_extension(x509.CRLNumber(number), critical=False)
