@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from holdfast._core import UNMEASURED_COST_MS
 from holdfast.client.url import Receiver, parse
 from holdfast.config import Config, json_schema, load, read_plans
-from holdfast.config.dump import effective
 from holdfast.config.initial_values import InitialRun
 from holdfast.config.models.devices import DestinationConfig, DeviceConfig, ReadConfig
 from holdfast.config.models.listeners import (
@@ -292,25 +291,6 @@ def test_rest_has_the_documented_defaults(loaded: Callable[..., Config]) -> None
     assert (rest.max_body, rest.max_connections, rest.request_timeout) == (8388608, 128, 10)
     assert (rest.max_connections_per_source, rest.when_full) == (64, "evict")
     assert rest.tokens == "none"
-
-
-@pytest.mark.parametrize("key", ["max_requests_per_source", "max_writes_per_source"])
-@pytest.mark.parametrize(
-    "kind", ["modbus-tcp", "modbus-ascii-over-tcp", "modbus-udp", "raw-ingest"]
-)
-def test_no_limit_per_second_is_what_always_holds(
-    loaded: Callable[..., Config], kind: str, key: str
-) -> None:
-    more = "areas: [coils]" if kind == "raw-ingest" else "access: read-only"
-    rule = f"{{sources: [10.0.0.7], units: {{1: plant}}, {more}}}"
-    scada = f"{{type: {kind}, bind: '[::1]:502', rules: [{rule}], {key}: null}}"
-    config = loaded(f"{SERVED}listeners:\n  scada: {scada}\n")
-    [warning] = config.warnings
-    assert (warning.key, warning.message) == (
-        f"listeners.scada.{key}",
-        "has no effect: an address waits only while others do: delete the key",
-    )
-    assert key not in effective(config.listeners["scada"].model_dump())
 
 
 def test_the_hash_of_a_token_is_kept_in_small_letters(loaded: Callable[..., Config]) -> None:

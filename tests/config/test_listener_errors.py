@@ -251,6 +251,9 @@ def test_serial_lines_need_ports_of_their_own(folder: Folder, device: str) -> No
          "request_timeout, format, tls, compat, rules"),
         ("    bind", "    tls: 1\n    bind", "7: tls: found 1, allowed: a mapping with the keys "
          "cert_file, key_file, key_passphrase_file, ca_file, crl_file, review"),
+        ("    bind", "    max_requests_per_source: null\n    bind",
+         "7: max_requests_per_source: removed, there is no limit per second: an address waits only "
+         "while others do: delete the key"),
         ("    bind", "    max_writes_per_source: 20\n    bind",
          "7: max_writes_per_source: removed, there is no limit per second: an address waits only "
          "while others do: delete the key"),

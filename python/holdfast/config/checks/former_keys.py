@@ -12,9 +12,6 @@ if TYPE_CHECKING:
     from holdfast.config.text.report import Report
     from holdfast.config.text.yaml_document import KeyPath
 
-_NO_LIMIT = "an address waits only while others do: delete the key"
-_PER_SECOND = ("max_requests_per_source", "max_writes_per_source")
-"""Former keys of listeners, whose null was what always holds now."""
 _RELAXED = {"packets": "many", "after_refusal": "continue", "crc": "none", "flags": "ignore"}
 """What relaxes the raw ingest protocol, with the only value of each key. They were keys of the
 listener itself before."""
@@ -30,10 +27,11 @@ def _relaxed(key: str, found: object) -> str:
 
 
 FORMER: dict[str, str | Callable[[str, object], str]] = {
-    **{
-        f"listeners.*.{key}": f"removed, there is no limit per second: {_NO_LIMIT}"
-        for key in _PER_SECOND
-    },
+    **dict.fromkeys(
+        ("listeners.*.max_requests_per_source", "listeners.*.max_writes_per_source"),
+        "removed, there is no limit per second: an address waits only while others do: delete the "
+        "key",
+    ),
     **{f"listeners.<raw-ingest>.{key}": _relaxed for key in _RELAXED},
     **{f"listeners.<modbus-tcp>.raw_ingest.{key}": _relaxed for key in _RELAXED},
     **dict.fromkeys(
@@ -65,11 +63,6 @@ FORMER: dict[str, str | Callable[[str, object], str]] = {
 
 def take_out_former_keys(report: Report) -> None:
     """Reports former keys, and removes them from the data."""
-    for name, listener in mapping(report.document.data.get("listeners")).items():
-        for key in _PER_SECOND:
-            if mapping(listener).get(key, 0) is None:
-                report.warn(("listeners", name, key), f"has no effect: {_NO_LIMIT}")
-                del listener[key]
     for place, message in FORMER.items():
         *parts, key = place.split(".")
         for path, owner in _owners(report.document.data, parts, ()):
