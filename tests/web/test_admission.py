@@ -1,4 +1,4 @@
-"""Who has to leave an HTTP server that is full. The core tests the rules: `admission.rs`."""
+"""Who has to leave an HTTP server that is full. The core tests the rules: `eviction.rs`."""
 
 from __future__ import annotations
 

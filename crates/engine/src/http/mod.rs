@@ -1,5 +1,6 @@
-//! HTTP/1.1 (RFC 9112): hyper parses requests and writes responses. This module admits peers, limits
-//! what they may take and how long, and hands requests to an event loop in another thread.
+//! HTTP/1.1 (RFC 9112): hyper parses requests and writes responses. This module limits what a peer may take,
+//! and how long, and hands requests to an event loop in another thread. `crate::server::connections` admits
+//! peers, and closes connections for others.
 //!
 //! * A request is handed over with its body if both have arrived together; otherwise the handler asks
 //!   for the body, after it has judged the rest.

@@ -4,6 +4,7 @@ pub(crate) mod admission;
 pub(crate) mod closing;
 pub(crate) mod connection;
 pub(crate) mod deadlines;
+mod eviction;
 pub(crate) mod listener;
 pub(crate) mod peer;
 pub(crate) mod reloadable;
