@@ -8,15 +8,14 @@
 //! After a failed connect, requests fail immediately until a pause is over ([`limits::connect_pause`]).
 //! `Connection`, in `holdfast_protocol`, decides when a connection ends. The next request opens a new one.
 
-mod access;
 mod caller;
 mod fault;
 pub(crate) mod limits;
+mod local_link;
 mod route;
 pub(crate) mod scheduling;
 pub(crate) mod sockets;
 
-pub(crate) use access::Link;
 pub use caller::{Called, Caller};
 pub use fault::Fault;
 pub(crate) use fault::{confirmation, exception, exception_code, exception_in, fault};
@@ -25,6 +24,7 @@ pub use limits::lease_fence::{Fence, Stage};
 pub(crate) use limits::lease_fence::{Pass, submit_under};
 pub(crate) use limits::permit::{Permit, Wanted};
 pub(crate) use limits::standstill;
+pub(crate) use local_link::Link;
 pub(crate) use route::{Asker, Call, Receiver};
 pub use route::{LinkCounters, LinkSettings, Route, SharedLink, Withdrawal};
 pub use scheduling::in_flight::InFlight;

@@ -2,6 +2,7 @@
 //! damaged one.
 
 use super::rtu::{CRC_START, MAX_LEN, decode, extended};
+use crate::pdu::{DataLen, request_data_len};
 
 /// What is at the start of a stream of requests. A caller must handle each case, so this enum is
 /// exhaustive.
@@ -198,75 +199,6 @@ fn whole(frame: &[u8]) -> Found<'_> {
     match decode(frame) {
         Ok((unit_id, pdu)) => Found::Frame { unit_id, pdu, len },
         Err(_) => Found::Damaged { len },
-    }
-}
-
-enum DataLen {
-    Known(usize),
-    /// The length is in a later byte.
-    Incomplete,
-    Unknown,
-}
-
-/// Whether a server on a serial line reads this PDU as exactly one request. If a PDU of a standard function
-/// is too long, the server takes the excess bytes as the start of another request. The length of other
-/// functions is unknown: returns true.
-///
-/// ```
-/// use holdfast_protocol::frame::rtu_stream::is_one_request;
-///
-/// assert!(is_one_request(&[3, 0, 5, 0, 1]));
-/// assert!(!is_one_request(&[3, 0, 5, 0, 1, 0x94, 0x0B, 1, 6, 0, 5, 0xBE, 0xEF]));
-/// assert!(!is_one_request(&[16, 0, 5, 0, 1, 2, 0xBE]));
-/// assert!(is_one_request(&[66, 1, 2, 3]));
-/// ```
-pub fn is_one_request(pdu: &[u8]) -> bool {
-    let Some((function_code, data)) = pdu.split_first() else { return false };
-    match request_data_len(*function_code, data) {
-        DataLen::Known(len) => data.len() == len,
-        DataLen::Incomplete => false,
-        DataLen::Unknown => true,
-    }
-}
-
-/// Whether a server on a serial line finds no other request in this PDU, though it may be longer than its
-/// function requires: some devices take two bytes more, as function 6 with a value of 32 bits has, and
-/// function 8 with two words. For all others these bytes can only be the CRC. The CRC of the frame is then
-/// 0, and no request begins with that. The length of other functions is unknown: returns true.
-///
-/// ```
-/// use holdfast_protocol::frame::rtu_stream::hides_no_request;
-///
-/// assert!(hides_no_request(&[6, 0, 5, 0, 1, 0xE2, 0x40]));
-/// assert!(!hides_no_request(&[6, 0, 5, 0, 1, 0xE2, 0x40, 1]));
-/// assert!(!hides_no_request(&[3, 0, 5, 0, 1, 0x94, 0x0B, 1, 6, 0, 5, 0xBE, 0xEF]));
-/// assert!(!hides_no_request(&[6, 0, 5, 0]));
-/// ```
-pub fn hides_no_request(pdu: &[u8]) -> bool {
-    is_one_request(pdu)
-        || pdu.len().checked_sub(2).is_some_and(|shorter| is_one_request(&pdu[..shorter]))
-}
-
-/// Returns the length of the data between function code and CRC (V1.1b3, 6).
-fn request_data_len(function_code: u8, data: &[u8]) -> DataLen {
-    let counted = |at: usize| {
-        data.get(at)
-            .map_or(DataLen::Incomplete, |count| DataLen::Known(at + 1 + usize::from(*count)))
-    };
-    match function_code {
-        1..=6 | 8 => DataLen::Known(4),
-        7 | 11 | 12 | 17 => DataLen::Known(0),
-        15 | 16 => counted(4),
-        20 | 21 => counted(0),
-        22 => DataLen::Known(6),
-        23 => counted(8),
-        24 => DataLen::Known(2),
-        43 => match data.first() {
-            None => DataLen::Incomplete,
-            Some(14) => DataLen::Known(3),
-            Some(_) => DataLen::Unknown,
-        },
-        _ => DataLen::Unknown,
     }
 }
 

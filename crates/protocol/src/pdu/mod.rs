@@ -16,6 +16,7 @@ mod range;
 pub mod reply;
 mod request;
 mod request_error;
+mod request_length;
 mod response;
 mod sub_function;
 
@@ -27,6 +28,8 @@ pub use function::{ExceptionCode, Function};
 pub use range::{BitRange, Range, RegisterRange};
 pub use request::Request;
 pub use request_error::RequestError;
+pub(crate) use request_length::{DataLen, request_data_len};
+pub use request_length::{is_one_request, may_be_passed_on};
 pub use response::{Response, ResponseError};
 pub use sub_function::SubFunction;
 

@@ -12,11 +12,11 @@ use tokio::task::spawn_local;
 use tokio::time::Instant;
 
 use crate::client::ClientError;
-use crate::link::access::Link;
 use crate::link::fault::{Exchanged, Fault, exception, exception_code, fault};
 use crate::link::limits::circuit_breaker::{Down, OPEN_AFTER_TIMEOUTS};
 use crate::link::limits::permit::{Permit, Wanted};
 use crate::link::limits::standstill;
+use crate::link::local_link::Link;
 use crate::link::route::{Call, LinkSettings, Reply, SharedLink};
 use crate::link::scheduling::shared_reads::{SharedReads, shareable};
 use crate::link::scheduling::write_barrier::Order;

@@ -278,7 +278,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             self.has_read_all = !self.is_unaware && read < room;
             self.renew()?;
             self.answering.gives_up =
-                !F::HAS_IDS && self.answering.is_waiting() && self.deadlines.has_paused();
+                !F::HAS_IDS && self.answering.is_waiting() && self.deadlines.has_given_up();
             let answered = self.answering.answer(&input[..partial + read], output);
             self.note_answered(&answered, WORK_OF_READ);
             let output = &output[..answered.len];

@@ -4,13 +4,11 @@ use std::time::Duration;
 
 use tokio::time::Instant;
 
+use crate::server::connections::given_up::has_given_up;
 use crate::server::reports::event::Kind;
 
 /// A timer without a deadline fires after this time.
 pub(crate) const NO_DEADLINE: Duration = Duration::from_secs(30 * 365 * 24 * 3600);
-
-/// Requests that are sent together arrive within this time of each other, also if TCP sends a segment again.
-pub(crate) const BURST_TIME: Duration = Duration::from_millis(250);
 
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Timeouts {
@@ -90,10 +88,9 @@ impl Deadlines {
         self.last_request = now;
     }
 
-    /// Whether what arrives now was sent after a pause, not together with the last request or because of
-    /// the last reply.
-    pub(super) fn has_paused(&self) -> bool {
-        self.last_request.elapsed() > self.timeouts.frame.unwrap_or_default().max(BURST_TIME)
+    /// Whether what arrives now shows that a client without transaction ids has given up.
+    pub(super) fn has_given_up(&self) -> bool {
+        has_given_up(self.last_request.elapsed(), self.timeouts.frame)
     }
 
     /// All that has arrived was complete.

@@ -5,6 +5,7 @@ pub(crate) mod closing;
 pub(crate) mod connection;
 pub(crate) mod deadlines;
 mod eviction;
+pub(crate) mod given_up;
 pub(crate) mod listener;
 pub(crate) mod peer;
 pub(crate) mod reloadable;

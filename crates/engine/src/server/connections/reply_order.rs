@@ -5,8 +5,7 @@
 //! effects of those. All behind it wait too. The connection is read meanwhile: its end, a repetition or a newer
 //! request may mean that those that wait are not sent.
 //!
-//! Without transaction ids, a client that sends another request after a pause has given up: no reply to an
-//! earlier one may come then.
+//! No reply may come to a request that its client has given up (`given_up.rs`).
 
 use std::collections::VecDeque;
 use std::net::IpAddr;

@@ -6,12 +6,11 @@
 //! not sealed (06), the range is inside its area (02), what it mirrors is not stale (0B). The last three
 //! are checked in `holdfast_memory::Memory`, under its lock. A denied function is refused before the unit
 //! is looked up, so that a peer without rights cannot discover units. A unit in listen only mode never
-//! answers.
+//! answers. Of the form of a request for a device, only the length is checked (03, [`pdu::may_be_passed_on`]).
 
 use std::sync::Arc;
 
 use holdfast_memory::{Access, Area, Memory, Read, Write};
-use holdfast_protocol::frame::rtu_stream::hides_no_request;
 use holdfast_protocol::pdu::{
     self, Buffer, Diagnostics, ExceptionCode, Function, Range, Request, SubFunction, reply,
 };
@@ -200,7 +199,7 @@ impl UnitServer {
             _ if !rights.allows(unit_id, function_code) => Err(NOT_ALLOWED),
             // A gateway may put it on a line, whose devices could read it as several requests: with
             // functions, and for units, that the peer may not use.
-            Elsewhere::Device(_) if !hides_no_request(request) => {
+            Elsewhere::Device(_) if !pdu::may_be_passed_on(request) => {
                 Err(ExceptionCode::IllegalDataValue)
             }
             Elsewhere::Device(_) if rights.denies(unit_id, request) => Err(NOT_ALLOWED),

@@ -1,7 +1,6 @@
 //! Which functions a rule allows, and which requests are known to only read.
 
-use holdfast_protocol::frame::rtu_stream::is_one_request;
-use holdfast_protocol::pdu::{ExceptionCode, Function, Request};
+use holdfast_protocol::pdu::{ExceptionCode, Function, Request, is_one_request};
 
 /// What answers the requests to a unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

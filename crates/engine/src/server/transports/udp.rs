@@ -18,7 +18,7 @@ use tokio::sync::watch;
 use tokio::task::{JoinSet, yield_now};
 
 use crate::link::{Asker, Reply, source};
-use crate::server::connections::deadlines::BURST_TIME;
+use crate::server::connections::given_up::has_given_up;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::connections::reply_order::{Asked, Expected, MAX_WAITING};
@@ -287,8 +287,7 @@ impl Later {
         MAX_PENDING_REPLIES.saturating_sub(self.replies.len()) <= self.waiting(address)
     }
 
-    /// Waits for a reply. Without transaction ids, a peer that asks again after a pause has given it up: it would
-    /// take the reply for the one to the newer request.
+    /// Waits for a reply, unless its peer gives it up.
     fn begin(
         &mut self,
         asker: &Asker,
@@ -303,7 +302,7 @@ impl Later {
         newest.1 += 1;
         let mut newest = newest.0.subscribe();
         self.replies.spawn(async move {
-            let is_late = |newest: &Instant| newest.duration_since(asked) > BURST_TIME;
+            let is_late = |newest: &Instant| has_given_up(newest.duration_since(asked), None);
             let given_up = async { newest.wait_for(is_late).await.map(drop) };
             let mut reply = std::pin::pin!(reply);
             tokio::select! {
@@ -340,10 +339,10 @@ impl Later {
         }
     }
 
-    /// Whether a peer has asked again, after a pause.
+    /// Whether a peer has asked again, and given up what it asked at that time.
     fn has_asked_again(&self, peer: SocketAddr, asked: Instant) -> bool {
         let newest = self.newest.get(&peer).map(|(newest, _)| *newest.borrow());
-        newest.is_some_and(|newest| newest.duration_since(asked) > BURST_TIME)
+        newest.is_some_and(|newest| has_given_up(newest.duration_since(asked), None))
     }
 
     /// A peer waits for one reply less.
@@ -430,6 +429,7 @@ mod tests {
     use holdfast_memory::{Area, Layout, Memory, Span};
 
     use super::*;
+    use crate::server::connections::given_up::BURST_TIME;
     use crate::server::connections::listener::bind_udp;
     use crate::server::requests::identity::Identity;
     use crate::server::rights::functions::{AccessMode, Functions};

@@ -1,4 +1,5 @@
-//! A link as the poller uses it: its requests, in turns with those of others.
+//! A link on its own thread: sends the requests of the poller and of all others in turns. Other threads use
+//! [`SharedLink`](super::SharedLink).
 
 use std::cell::{Cell, RefCell};
 use std::rc::Rc;
