@@ -88,7 +88,8 @@ impl Schedule {
     }
 }
 
-/// The first polls of devices are spread over their interval, or over this if that is less.
+/// The first polls of devices are spread over their interval, or over this if that is less. The scanner has a
+/// shorter time (`start_within`).
 pub const FIRST_POLL_SPREAD: Duration = Duration::from_secs(10);
 
 /// When the device with this number is polled first, after the start: the golden ratio spreads any number

@@ -4,9 +4,7 @@ use rustls::pki_types::{CertificateDer, SignatureVerificationAlgorithm, UnixTime
 use rustls::{CertificateError, ExtendedKeyPurpose};
 use webpki::KeyPurposeId;
 use x509_cert::certificate::{CertificateInner, Profile};
-use x509_cert::der::asn1::{
-    AnyRef, BitString, ObjectIdentifier, OctetString, UintRef, Utf8StringRef,
-};
+use x509_cert::der::asn1::{AnyRef, BitString, ObjectIdentifier, OctetString, Utf8StringRef};
 use x509_cert::der::{self, Decode, Encode, Reader, SliceReader};
 use x509_cert::ext::pkix::{
     AuthorityKeyIdentifier, BasicConstraints, CrlDistributionPoints, ExtendedKeyUsage, KeyUsage,
@@ -17,8 +15,9 @@ use x509_cert::serial_number::SerialNumber;
 use x509_cert::spki::{AlgorithmIdentifierOwned, SubjectPublicKeyInfoOwned};
 
 use super::failure::TlsFailure;
-use super::provider::{ALGORITHMS, KEYS};
+use super::provider::ALGORITHMS;
 use super::rsa_pss;
+use super::supported_keys::{algorithm_content, check_key};
 
 /// The extension that holds the role (MB-TCP-Security, 8.4).
 const ROLE: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.4.1.50316.802.1");
@@ -26,20 +25,6 @@ const ROLE: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.4.1.50316.8
 const SERVER_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.1");
 const CLIENT_AUTH: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.5.5.7.3.2");
 const ANY_PURPOSE: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.29.37.0");
-
-const RSA: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.113549.1.1.1");
-const ELLIPTIC_CURVE: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.10045.2.1");
-const ED25519: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.101.112");
-
-const CURVES: [ObjectIdentifier; 3] = [
-    ObjectIdentifier::new_unwrap("1.2.840.10045.3.1.7"),
-    ObjectIdentifier::new_unwrap("1.3.132.0.34"),
-    ObjectIdentifier::new_unwrap("1.3.132.0.35"),
-];
-
-/// The allowed sizes of an RSA key, in bits.
-const MIN_RSA_BITS: usize = 2048;
-const MAX_RSA_BITS: usize = 8192;
 
 /// The most characters of a name and bytes of a serial number in a log.
 const MAX_SUBJECT_LEN: usize = 256;
@@ -200,43 +185,6 @@ impl Parsed {
         }
     }
 
-    /// # Errors
-    /// [`TlsFailure::UnsupportedCertificate`] for an unsupported key.
-    pub(super) fn has_supported_key(&self) -> Result<(), TlsFailure> {
-        let unsupported = |found: String| {
-            let flaw = format!("found {found}, allowed: {KEYS}");
-            Err(TlsFailure::UnsupportedCertificate { flaw })
-        };
-        let key = self.key();
-        let algorithm = &key.algorithm;
-        let is_pss = algorithm.oid == rsa_pss::ID_RSASSA_PSS;
-        if algorithm.oid == RSA || is_pss {
-            let bits = rsa_bits(key.subject_public_key.raw_bytes());
-            let bits = bits.ok_or(TlsFailure::BadCertificate)?;
-            if !(MIN_RSA_BITS..=MAX_RSA_BITS).contains(&bits) {
-                return unsupported(format!("an RSA key of {bits} bits"));
-            }
-            if is_pss && !self.key_algorithm().is_some_and(|der| rsa_pss::is_supported(&der)) {
-                let found = "an RSA-PSS key with other parameters than SHA-256, SHA-384 or SHA-512 \
-                             for hash and mask";
-                return unsupported(found.into());
-            }
-            return Ok(());
-        }
-        if algorithm.oid == ELLIPTIC_CURVE {
-            let curve = algorithm.parameters.as_ref().and_then(|any| any.decode_as().ok());
-            return match curve {
-                Some(curve) if CURVES.contains(&curve) => Ok(()),
-                Some(curve) => unsupported(format!("a key on the curve {curve}")),
-                None => unsupported("a key on a curve without a name".into()),
-            };
-        }
-        if algorithm.oid == ED25519 {
-            return Ok(());
-        }
-        unsupported(format!("a key of the kind {}", algorithm.oid))
-    }
-
     /// The content of the algorithm identifier of an RSA-PSS key; `None` for another kind of key.
     pub(super) fn pss_algorithm(&self) -> Option<Vec<u8>> {
         let is_pss = self.key().algorithm.oid == rsa_pss::ID_RSASSA_PSS;
@@ -303,7 +251,7 @@ impl Parsed {
         by: &AlgorithmIdentifierOwned,
         signature: &BitString,
     ) -> Option<bool> {
-        self.has_supported_key().ok()?;
+        check_key(self.key()).ok()?;
         let (with, of) = (algorithm_content(by), self.key_algorithm());
         let key = self.key().subject_public_key.raw_bytes();
         let fits = |algorithm: &&&dyn SignatureVerificationAlgorithm| {
@@ -372,20 +320,6 @@ impl Parsed {
 pub(super) fn name_text(name: &Name) -> String {
     let shown = |found: char| if found.is_control() { char::REPLACEMENT_CHARACTER } else { found };
     name.to_string().chars().take(MAX_SUBJECT_LEN).map(shown).collect()
-}
-
-/// The content of an algorithm identifier.
-fn algorithm_content(algorithm: &AlgorithmIdentifierOwned) -> Option<Vec<u8>> {
-    let der = algorithm.to_der().ok()?;
-    AnyRef::from_der(&der).ok().map(|sequence| sequence.value().to_vec())
-}
-
-/// The size of the modulus of an RSA key in PKCS#1, in bits.
-fn rsa_bits(key: &[u8]) -> Option<usize> {
-    let whole = AnyRef::from_der(key).ok()?;
-    let modulus: UintRef<'_> = SliceReader::new(whole.value()).ok()?.decode().ok()?;
-    let first = modulus.as_bytes().first()?;
-    Some(modulus.as_bytes().len() * 8 - first.leading_zeros() as usize)
 }
 
 #[cfg(test)]

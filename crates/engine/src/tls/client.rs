@@ -22,7 +22,7 @@ use super::files::FileError;
 use super::own_certificate::own;
 use super::provider::{handshake_signatures, provider};
 use super::revocation::Lists;
-use super::verification::{Listed, Trust};
+use super::trust::{Listed, Trust};
 use super::{Channel, TlsFailure};
 
 /// The TLS settings of a client.

@@ -15,7 +15,7 @@ use super::handshake_notes::{Chain, noted};
 use super::provider::handshake_signatures;
 use super::revocation::{List, Lists};
 use super::server_files::{Protocol, ServerFiles};
-use super::verification::{Listed, Trust};
+use super::trust::{Listed, Trust};
 
 /// Verifies the certificates of clients.
 #[derive(Debug)]
@@ -141,6 +141,7 @@ fn refused(failure: &TlsFailure) -> Error {
         | TlsFailure::RoleType
         | TlsFailure::UnsupportedExtension => CertificateError::BadEncoding,
         TlsFailure::WrongRole { .. } => CertificateError::ApplicationVerificationFailure,
+        // The alert certificate_unknown.
         other => return CertificateError::Other(OtherError(Arc::new(other.clone()))).into(),
     };
     error.into()

@@ -9,7 +9,7 @@ use super::certificate::{Parsed, name_text};
 use super::failure::{between, span};
 use super::revocation::List;
 use super::server_files::ServerFiles;
-use super::verification::{Listed, Trust};
+use super::trust::{Listed, Trust};
 
 /// Finds what is doubtful.
 pub(super) struct Doubts<'f> {

@@ -19,9 +19,10 @@ mod rsa_pss;
 pub mod server;
 mod server_files;
 mod sessions;
+mod supported_keys;
 #[cfg(test)]
 pub(crate) mod test_party;
-mod verification;
+mod trust;
 
 use std::io::{Read, Write};
 

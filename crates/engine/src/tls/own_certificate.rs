@@ -9,8 +9,9 @@ use rustls::{Error, InconsistentKeys};
 
 use super::certificate::Parsed;
 use super::files::{FileError, certificates, key, key_of};
-use super::provider::{KEYS, provider};
+use super::provider::provider;
 use super::rsa_pss::PssKey;
+use super::supported_keys::KEYS;
 
 /// Reads a certificate, with its intermediates, and its key. With `decrypted_key`, that is the
 /// content of the key's file.

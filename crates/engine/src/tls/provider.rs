@@ -13,9 +13,6 @@ use webpki::aws_lc_rs as algorithm;
 use super::p521::P521;
 use super::rsa_pss;
 
-/// The supported keys of certificates.
-pub(super) const KEYS: &str = "RSA or RSA-PSS of 2048 to 8192 bits, P-256, P-384, P-521, Ed25519";
-
 /// With TLS 1.2, a scheme names only the hash. With TLS 1.3, it also names the curve: the first
 /// entry of each row.
 pub(super) static ALGORITHMS: WebPkiSupportedAlgorithms = WebPkiSupportedAlgorithms {

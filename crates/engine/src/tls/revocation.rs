@@ -373,7 +373,7 @@ mod tests {
     use crate::tls::TlsFailure;
     use crate::tls::certificate::Purpose;
     use crate::tls::test_party::{Folder, Owner, revocations};
-    use crate::tls::verification::{Listed, Trust};
+    use crate::tls::trust::{Listed, Trust};
 
     /// Within the dates of every certificate and list.
     const NOW: UnixTime = UnixTime::since_unix_epoch(Duration::from_secs(1_800_000_000));

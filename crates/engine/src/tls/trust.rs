@@ -1,4 +1,4 @@
-//! Verifies certificates, for servers and clients alike.
+//! Which certificates are trusted, for servers and clients alike.
 //!
 //! * A listed certificate is trusted, regardless of its `CA` flag and `keyUsage`, unless it is revoked.
 //! * A listed authority ([`Parsed::is_authority`]) can issue certificates within its own dates.
@@ -24,6 +24,7 @@ use super::failure::{TlsFailure, between};
 use super::files::{FileError, certificates};
 use super::provider::ALGORITHMS;
 use super::revocation::Lists;
+use super::supported_keys::check_key;
 
 /// A trusted certificate.
 #[derive(Debug)]
@@ -153,7 +154,7 @@ impl Trust {
     ) -> Result<(), Error> {
         let parsed = Parsed::new(presented)?;
         let end_entity = EndEntityCert::try_from(presented).map_err(refused)?;
-        parsed.has_supported_key().map_err(wrapped)?;
+        check_key(parsed.key()).map_err(wrapped)?;
         parsed.is_valid_at(now)?;
         parsed.is_for(purpose)?;
         if let Some(listed) = self.listed.iter().find(|listed| listed.certificate == *presented) {

@@ -1,5 +1,5 @@
-//! The limits that refusals of a device have shown: unreadable ranges, cuts between ranges, and the
-//! size of a request. They are remembered for a while, then tried again.
+//! What a device has refused, and what that shows: unreadable ranges, cuts between ranges, and the size of
+//! a request. It is remembered for a while, then tried again.
 
 use std::time::Duration;
 
@@ -13,7 +13,7 @@ use crate::link::Fault;
 const FORGET_AFTER: Duration = Duration::from_secs(600);
 
 /// The interval between attempts to read an unreadable range.
-const RETRY_INTERVAL: Duration = Duration::from_secs(60);
+const RETRY_REFUSED_AFTER: Duration = Duration::from_secs(60);
 
 #[derive(Debug, Default)]
 pub(super) struct Learned {
@@ -63,7 +63,7 @@ impl Learned {
 
     /// The device refuses this block. Replaces what is known about an equal one.
     pub(super) fn refused(&mut self, block: &Block, fault: Fault) {
-        let (range, retry_at) = (block.range(), Instant::now() + RETRY_INTERVAL);
+        let (range, retry_at) = (block.range(), Instant::now() + RETRY_REFUSED_AFTER);
         debug_assert!(range.count > 0);
         self.unreadable.retain(|known| known.range != range);
         self.unreadable.push(Unreadable { range, fault, retry_at });
@@ -90,7 +90,7 @@ impl Learned {
         if known.retry_at > now && !in_any_case {
             return None;
         }
-        known.retry_at = now + RETRY_INTERVAL;
+        known.retry_at = now + RETRY_REFUSED_AFTER;
         Some(known.range)
     }
 
