@@ -173,6 +173,7 @@ impl Disk for FileOnDisk {
         {
             return Err(FileError::Foreign(format!("it begins with {}", begin.escape_ascii())));
         }
+        // Locks the file: fails with `DatabaseAlreadyOpen`, which is `FileError::Locked`, if another process has it.
         let file = FileBackend::new(fs::File::open(&self.path)?)?;
         Ok(builder.create_with_backend(Overlay::new(file))?)
     }

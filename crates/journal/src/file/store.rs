@@ -101,6 +101,7 @@ impl Store {
 
     /// Returns whether there was anything to store.
     fn try_store(&mut self, changes: Changes) -> Result<bool, FileError> {
+        // A file that is gone is written anew. Another file in its place is an error: `FileError::Replaced`.
         let is_gone = !self.disk.is_in_place()?;
         // What follows may fail when the new file is in place already.
         self.in_doubt |= is_gone;

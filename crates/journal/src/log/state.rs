@@ -132,7 +132,7 @@ impl State {
         self.steps += steps.len() as u64;
         let at = |done| CarriedOut { sequence: Some(place.sequence), ..done };
         let age = age(&origin);
-        // Their writers were answered `not_confirmed` long ago, and newer writes may have been confirmed since.
+        // After `Sender::deadline`. Their writers were answered `not_confirmed` long ago, and newer writes may have been confirmed since.
         let is_late = deadline.is_some_and(|deadline| place.stored > deadline);
         let carried_out = |step: &Step| {
             self.terms.admit(step.tenure)?;

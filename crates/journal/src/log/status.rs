@@ -84,7 +84,7 @@ pub struct Status {
     pub not_stored: u64,
     /// Steps of this node that a memory refused when it was their turn.
     pub refused: u64,
-    /// Messages that were applied before, or came too late.
+    /// Messages that were applied before, or that a later start of their node has overtaken.
     pub stale: u64,
     /// Messages that are not of a node.
     pub ignored: u64,

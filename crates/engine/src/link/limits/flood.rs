@@ -1,7 +1,8 @@
 //! Pauses for a device that floods its link with unsolicited data.
 //!
 //! A connection in a stream ends with the first bytes that belong to no request, so a device can cost one
-//! connection and one read of the socket for each poll. A flood is more than a faulty device sends.
+//! connection and one read of the socket for each poll. A flood is more than a faulty device sends. Over UDP,
+//! a number of datagrams is one too (`MAX_STRAY_DATAGRAMS` in `holdfast_protocol::client`).
 
 use std::cell::Cell;
 use std::sync::Arc;

@@ -1,4 +1,5 @@
-//! Access rules: which of them are for a peer. [`PeerRights`] takes the first of these that names a unit.
+//! Access rules: which of them are for a peer. [`PeerRights`] takes the first of these that names a unit, and
+//! decides what is refused.
 
 use std::collections::HashMap;
 use std::net::IpAddr;

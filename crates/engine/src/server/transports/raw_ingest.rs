@@ -5,8 +5,9 @@
 //! packet is answered at its last byte, or at the first that is wrong: what follows never changes its
 //! outcome, so the outcome does not depend on how the bytes were cut.
 //!
-//! After the last reply, the listener reads until the peer closes. What it reads behind an accepted
-//! packet is counted, because its sender does not speak this protocol: its packet may mean something else.
+//! After the last reply, the listener reads until the peer closes, for a limited time
+//! (`connections/closing.rs`). What it reads behind an accepted packet is counted, because its sender does
+//! not speak this protocol: its packet may mean something else.
 
 use std::collections::HashMap;
 use std::future::poll_fn;

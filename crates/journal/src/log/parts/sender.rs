@@ -268,7 +268,8 @@ impl Sender {
     }
 
     /// When the stream may store steps at the latest that are answered at `until`, by its own clock. A cut
-    /// network can deliver them later: the system goes on sending what this process has handed over.
+    /// network can deliver them later: the system goes on sending what this process has handed over. `State::apply`
+    /// refuses what is stored later.
     fn deadline(&self, until: Instant) -> i64 {
         let lead = self.stream_lead.expect("steps are taken once a message was applied");
         let left = until.saturating_duration_since(Instant::now()) + self.settings.write_timeout;
