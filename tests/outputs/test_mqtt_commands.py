@@ -331,7 +331,7 @@ def test_a_command_for_a_device_that_another_node_polls_has_no_reply(
 
     def refuse(site: _Site, device: str, *more: Any) -> None:
         if device == "pump":
-            raise NotWritten(fault_word(STANDBY), "another node uses the device")
+            raise NotWritten(fault_word(STANDBY), "this node may not use the device now")
         write(site, device, *more)
 
     if is_known:

@@ -594,5 +594,5 @@ def test_a_command_that_was_not_written_is_not_confirmed() -> None:
     registry.devices["plc"] = device(hmi=(1000, "scan", 0.0, "a"))
     unused = cast("Any", None)
     commands = Commands(settings, TENTACLE, registry, unused, Elsewhere(), unused)
-    with pytest.raises(Moved, match="not written: another node uses the device"):
+    with pytest.raises(Moved, match="not written: this node may not use the device now"):
         asyncio.run(commands.write("plc", "a", "1", lambda: 1.0))

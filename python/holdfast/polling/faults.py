@@ -29,7 +29,7 @@ _TEXTS = {
     FAULTS["not stored"]: "memory refused the values",
     FAULTS["internal error"]: "an internal error",
     FAULTS["flooded"]: "a flood of data that was not requested",
-    STANDBY: "another node uses the device",
+    STANDBY: "this node may not use the device now; another node may be using it",
     EXPIRED: "it has waited too long",
     WITHDRAWN: "its device was removed or changed",
 }

@@ -24,8 +24,8 @@ use super::{ClientError, Endpoint, Lost, Place, StrayCounters, connection};
 /// Bytes per read of a socket. No Modbus datagram is longer.
 const CHUNK_BYTES: usize = 512;
 
-/// Reads before the time goes on: a flood does not end.
-const MAX_READS_AT_ONCE: usize = 64;
+/// The most reads of one `drain`: a peer that never stops sending must not hold the caller past its deadline.
+const MAX_READS_PER_DRAIN: usize = 64;
 
 /// A TCP connection that was unused for this time is checked before it is used again.
 const CHECK_AFTER_IDLE: Duration = Duration::from_millis(50);
@@ -82,15 +82,15 @@ struct Call<'r> {
 pub struct Conditions<'c> {
     /// Asked before a connection is made for the request, at least every 0.1 s while it waits until it can be
     /// sent, and, with true, at the last moment before its first bytes are sent.
-    pub to_begin: &'c dyn Fn(bool) -> Result<(), ClientError>,
+    pub may_send: &'c dyn Fn(bool) -> Result<(), ClientError>,
     /// Asked before bytes are sent, and then at most every 0.1 s. If it is false, the connection is
     /// closed.
-    pub to_go_on: Option<&'c dyn Fn() -> bool>,
+    pub may_continue: Option<&'c dyn Fn() -> bool>,
 }
 
 impl Conditions<'_> {
-    fn may_go_on(&self) -> bool {
-        self.to_go_on.is_none_or(|may_go_on| may_go_on())
+    fn may_continue(&self) -> bool {
+        self.may_continue.is_none_or(|may_continue| may_continue())
     }
 }
 
@@ -114,19 +114,19 @@ impl BlockingClient {
     }
 
     /// As [`BlockingClient::call`], unless `interrupted` returns true. It is asked at most every 0.1 s.
-    /// Returns `None` then, and the connection is closed: a reply would still come. `to_begin` is as in
+    /// Returns `None` then, and the connection is closed: a reply would still come. `may_send` is as in
     /// [`Conditions`]. `was_sent` becomes true before the first bytes are sent.
     pub fn interruptible_call<T>(
         &self,
         interrupted: &mut dyn FnMut() -> bool,
-        to_begin: &dyn Fn(bool) -> Result<(), ClientError>,
+        may_send: &dyn Fn(bool) -> Result<(), ClientError>,
         was_sent: &AtomicBool,
         (unit_id, request): (u8, &EncodedRequest),
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Option<Result<T, ClientError>> {
         let interrupt = Interrupt::new(Some(interrupted));
-        let conditions = &Conditions { to_begin, to_go_on: None };
+        let conditions = &Conditions { may_send, may_continue: None };
         let attempt = Attempt::default();
         let call = Call { unit_id, request, attempt, conditions, was_sent, refused: None };
         self.call_unless(interrupt, call, timeout, take)
@@ -138,7 +138,7 @@ impl BlockingClient {
     ///
     /// # Errors
     /// [`ClientError`]: the request failed, or there is no connection; or that of
-    /// [`Conditions::to_begin`], if nothing was sent.
+    /// [`Conditions::may_send`], if nothing was sent.
     pub fn call<T>(
         &self,
         conditions: &Conditions<'_>,
@@ -147,8 +147,8 @@ impl BlockingClient {
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Result<T, ClientError> {
-        let mut interrupted = || !conditions.may_go_on();
-        let interrupt = Interrupt::new(match conditions.to_go_on {
+        let mut interrupted = || !conditions.may_continue();
+        let interrupt = Interrupt::new(match conditions.may_continue {
             None => None,
             Some(_) => Some(&mut interrupted),
         });
@@ -157,7 +157,7 @@ impl BlockingClient {
         let call = Call { unit_id, request, attempt, conditions, was_sent, refused: None };
         let called = self.call_unless(interrupt, call, timeout, take);
         called.unwrap_or_else(|| {
-            assert!(conditions.to_go_on.is_some(), "nobody interrupts this call");
+            assert!(conditions.may_continue.is_some(), "nobody interrupts this call");
             Err(ClientError::Lost(Lost::Closed(Closed::BySelf)))
         })
     }
@@ -175,8 +175,8 @@ impl BlockingClient {
         let mut take = Some(take);
         let mut deadline = Instant::now() + timeout;
         loop {
-            if let Err(error) = (conditions.to_begin)(false) {
-                if !conditions.may_go_on() {
+            if let Err(error) = (conditions.may_send)(false) {
+                if !conditions.may_continue() {
                     state.end();
                 }
                 return Some(Err(error));
@@ -330,7 +330,7 @@ impl BlockingClient {
     pub(crate) fn close_if_lost(&self) {
         let mut state = lock(&self.state);
         let Some(open) = &mut state.open else { return };
-        let received = open.receive_waiting(&mut [0; CHUNK_BYTES], &mut |_| {});
+        let received = open.drain(&mut [0; CHUNK_BYTES], &mut |_| {});
         open.count_strays(&self.strays);
         if received.is_err() || open.connection.closed().is_some() {
             state.end();
@@ -410,13 +410,13 @@ impl Open {
         counters.take(&mut self.connection, &mut self.late);
     }
 
-    /// Takes what has come while the process had no processor: it is no reply to what is sent from now on.
-    fn receive_waiting(
+    /// Reads what has arrived, without waiting: it must not be taken for the reply to a later request.
+    fn drain(
         &mut self,
         chunk: &mut [u8],
         sink: &mut impl FnMut(Done<'_>),
     ) -> Result<(), StreamError> {
-        for _ in 0..MAX_READS_AT_ONCE {
+        for _ in 0..MAX_READS_PER_DRAIN {
             let Some(len) = self.stream.receive_now(chunk)? else { break };
             self.connection.receive(&chunk[..len], self.epoch.elapsed(), &mut *sink);
         }
@@ -462,7 +462,7 @@ impl Open {
         let ticket = match sent {
             Ok(ticket) => ticket,
             Err(why) => {
-                // All transaction ids wait for late replies.
+                // It is closed, or all transaction ids wait for late replies.
                 call.refused = Some(ClientError::new(why.failure(), timeout));
                 self.connection.close(why, sink);
                 return Ok(());
@@ -473,18 +473,18 @@ impl Open {
             let outgoing = self.connection.outgoing();
             let is_sent = !outgoing.is_empty();
             // Also while it waits for late replies: the next request may have nothing to wait for.
-            if !has_begun && let Err(error) = (call.conditions.to_begin)(is_sent) {
+            if !has_begun && let Err(error) = (call.conditions.may_send)(is_sent) {
                 call.refused = Some(error);
                 if !is_sent {
                     self.connection.cancel(ticket, self.epoch.elapsed());
                 }
-                if self.connection.in_flight() > 0 || !call.conditions.may_go_on() {
+                if self.connection.in_flight() > 0 || !call.conditions.may_continue() {
                     self.connection.close(Closed::BySelf, sink);
                 }
                 return Ok(());
             }
             if is_sent {
-                if !call.conditions.may_go_on() {
+                if !call.conditions.may_continue() {
                     self.connection.close(Closed::BySelf, sink);
                     return Ok(());
                 }
@@ -520,7 +520,7 @@ impl Open {
                 // The end of a slice.
                 Err(StreamError::TimedOut) if Instant::now() < until => {}
                 Err(StreamError::TimedOut) => {
-                    self.receive_waiting(&mut chunk, sink)?;
+                    self.drain(&mut chunk, sink)?;
                     self.connection.advance(self.epoch.elapsed(), &mut *sink);
                 }
                 Err(error) => return Err(error),
@@ -542,7 +542,7 @@ mod tests {
 
     use super::*;
 
-    const ANY_TIME: Conditions<'static> = Conditions { to_begin: &|_| Ok(()), to_go_on: None };
+    const ANY_TIME: Conditions<'static> = Conditions { may_send: &|_| Ok(()), may_continue: None };
 
     /// A stream whose second copy of a reply waits unread when the guard time is over, because the process had no
     /// processor.
@@ -653,11 +653,11 @@ mod tests {
             late: 0,
         });
         let asked = Cell::new(0);
-        let to_begin = |is_sent: bool| {
+        let may_send = |is_sent: bool| {
             asked.set(asked.get() + 1);
             if is_sent || asked.get() > 3 { Err(ClientError::Expired) } else { Ok(()) }
         };
-        let conditions = Conditions { to_begin: &to_begin, to_go_on: None };
+        let conditions = Conditions { may_send: &may_send, may_continue: None };
         let answer = client.call(&conditions, 1, &write, timeout, |_, _| ());
         assert!(matches!(answer, Err(ClientError::Expired)), "{answer:?}");
         assert_eq!(asked.get(), 4);
@@ -672,8 +672,8 @@ mod tests {
         let (host, port) = ("127.0.0.1".to_owned(), listener.local_addr().unwrap().port());
         let place = Place::Tcp { host, port, tls: None };
         let client = BlockingClient::new(Endpoint { place, tolerance: Tolerance::default() });
-        let to_begin = |is_sent| if is_sent { Err(ClientError::Expired) } else { Ok(()) };
-        let conditions = Conditions { to_begin: &to_begin, to_go_on: None };
+        let may_send = |is_sent| if is_sent { Err(ClientError::Expired) } else { Ok(()) };
+        let conditions = Conditions { may_send: &may_send, may_continue: None };
         let write = EncodedRequest::new(&Request::WriteSingleRegister { address: 0, value: 1 });
         let answer = client.call(&conditions, 1, &write, Duration::from_secs(60), |_, _| ());
         assert!(matches!(answer, Err(ClientError::Expired)), "{answer:?}");

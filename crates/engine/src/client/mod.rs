@@ -66,7 +66,7 @@ pub enum ClientError {
     #[error("invalid response: {0}")]
     Invalid(InvalidResponse),
     /// The device may not be used now: another process may use it. Nothing was sent.
-    #[error("another node uses the device")]
+    #[error("this node may not use the device now; another node may be using it")]
     Fenced,
     /// The request was not sent in time. Nothing was sent.
     #[error("not sent: it has waited too long")]

@@ -130,8 +130,8 @@ fn carried_out(client: &BlockingClient, call: &Call, pause: &ConnectPause) -> Ex
     let Call { unit_id, ref request, timeout, ref permit, .. } = *call;
     let allows = permit.fence.as_ref().map(|fence| || fence.allows());
     let conditions = Conditions {
-        to_begin: &|is_sent| permit.check(is_sent),
-        to_go_on: allows.as_ref().map(|allows| allows as &dyn Fn() -> bool),
+        may_send: &|is_sent| permit.check(is_sent),
+        may_continue: allows.as_ref().map(|allows| allows as &dyn Fn() -> bool),
     };
     let answer = client.call(&conditions, unit_id, request, timeout, |_, pdu| pdu.to_vec());
     let answer = answer.map_err(Arc::new);
