@@ -4,7 +4,7 @@ use std::collections::HashMap;
 use std::hash::{BuildHasher, RandomState};
 use std::sync::Mutex;
 
-use holdfast_engine::http::{HttpServer, Parts};
+use holdfast_engine::http::{CONTENT_LENGTH, Parts, Version};
 use holdfast_runtime::lock;
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyDict, PyList, PyTuple};
@@ -46,7 +46,7 @@ impl Heads {
             return Ok((head.parts.bind(py).clone(), head.kept.bind(py).clone()));
         }
         let kept = PyDict::new(py);
-        let parts = made(py, parts, &kept)?;
+        let parts = head_to_python(py, parts, &kept)?;
         if bytes.len() <= MAX_HEAD_BYTES {
             let mut known = lock(&self.known);
             if known.len() == MAX_HEADS {
@@ -63,7 +63,7 @@ impl Heads {
     }
 }
 
-fn made<'py>(
+fn head_to_python<'py>(
     py: Python<'py>,
     parts: &Parts,
     kept: &Bound<'py, PyDict>,
@@ -90,7 +90,7 @@ fn bytes_of(parts: &Parts) -> Vec<u8> {
 }
 
 fn version_of(parts: &Parts) -> &'static str {
-    if parts.version == HttpServer::HTTP_10 { "1.0" } else { "1.1" }
+    if parts.version == Version::HTTP_10 { "1.0" } else { "1.1" }
 }
 
 fn query_of(parts: &Parts) -> &str {
@@ -99,6 +99,6 @@ fn query_of(parts: &Parts) -> &str {
 
 /// Without the length of the body, which differs between requests of one kind.
 fn headers_of(parts: &Parts) -> impl Iterator<Item = (&[u8], &[u8])> {
-    let others = parts.headers.iter().filter(|(name, _)| *name != HttpServer::CONTENT_LENGTH);
+    let others = parts.headers.iter().filter(|(name, _)| *name != CONTENT_LENGTH);
     others.map(|(name, value)| (name.as_str().as_bytes(), value.as_bytes()))
 }

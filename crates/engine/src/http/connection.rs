@@ -22,9 +22,9 @@ use tokio::time::{Sleep, sleep_until, timeout_at};
 use super::exchange::{Abandoned, Event, Exchange, Order, RequestHead, ResponseHead};
 use super::front::Front;
 use super::line::{SharedLine, Verdict, Wire};
-use super::output::Output;
 use super::refusal::{Refusal, RefusalBody};
 use super::request_bytes::MAX_HEADER_BYTES;
+use super::response_body::ResponseBody;
 use crate::server::Peer;
 use crate::server::connections::admission::Ticket;
 use crate::server::connections::closing::drain_for;
@@ -243,7 +243,7 @@ fn answered(
     front: Arc<Front>,
     line: SharedLine,
     request: Request<Incoming>,
-) -> impl Future<Output = Result<Response<Output>, Abandoned>> {
+) -> impl Future<Output = Result<Response<ResponseBody>, Abandoned>> {
     let exchange = front.exchange();
     let len = request.body().size_hint().exact();
     let version = request.version();
@@ -272,7 +272,7 @@ async fn handled(
     exchange: Arc<Exchange>,
     request: Request<Incoming>,
     has_body: bool,
-) -> Result<Response<Output>, Abandoned> {
+) -> Result<Response<ResponseBody>, Abandoned> {
     let (parts, body) = request.into_parts();
     let len = body.size_hint().exact();
     let expects = parts.headers.contains_key(EXPECT);
@@ -301,9 +301,9 @@ async fn handled(
     let response = match upload.ordered(&front, &exchange).await {
         Answered::Whole { head, body, mut closes } => {
             closes |= is_old || !upload.skipped(&front, &exchange, closes || expects).await;
-            Output::whole(parts, head, body, closes)
+            ResponseBody::whole(parts, head, body, closes)
         }
-        Answered::Stream(head) => Output::stream(parts, head),
+        Answered::Stream(head) => ResponseBody::stream(parts, head),
         Answered::Nothing => return Err(Abandoned),
     };
     line.lock().note_answering();
@@ -312,11 +312,11 @@ async fn handled(
 }
 
 /// Refuses a request that hyper accepts.
-fn refused(front: &Front, exchange: Arc<Exchange>, line: SharedLine) -> Response<Output> {
+fn refused(front: &Front, exchange: Arc<Exchange>, line: SharedLine) -> Response<ResponseBody> {
     let RefusalBody { headers, body } = front.refusal(Refusal::NotHttp);
     let head = ResponseHead { status: StatusCode::BAD_REQUEST, headers: headers.clone() };
     line.lock().note_answering();
-    Output::whole((exchange, line.clone()), head, body.clone(), true)
+    ResponseBody::whole((exchange, line.clone()), head, body.clone(), true)
 }
 
 /// Tells the handler that the client is gone if the connection ends before there is a response.

@@ -18,11 +18,13 @@ mod front;
 pub mod in_memory;
 mod inbox;
 mod line;
-mod output;
 mod refusal;
 mod request_bytes;
+mod response_body;
 mod server;
 
+pub use hyper::Version;
+pub use hyper::header::CONTENT_LENGTH;
 pub use hyper::http::request::Parts;
 
 pub use exchange::{Event, Exchange, RequestHead, ResponseHead, Sent};

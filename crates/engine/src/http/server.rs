@@ -68,9 +68,6 @@ pub struct HttpServer {
 }
 
 impl HttpServer {
-    pub const HTTP_10: hyper::Version = hyper::Version::HTTP_10;
-    pub const CONTENT_LENGTH: hyper::header::HeaderName = hyper::header::CONTENT_LENGTH;
-
     /// A server on a socket that listens. It accepts nothing yet.
     ///
     /// # Errors

@@ -13,7 +13,7 @@ use super::exchange::{Abandoned, Exchange, ResponseHead};
 use super::line::SharedLine;
 
 /// The body of a response. When it is dropped, the response is complete, or the connection is broken.
-pub(super) struct Output {
+pub(super) struct ResponseBody {
     exchange: Arc<Exchange>,
     line: SharedLine,
     content: Content,
@@ -25,36 +25,36 @@ enum Content {
     Ended,
 }
 
-impl Output {
+impl ResponseBody {
     pub(super) fn whole(
         (exchange, line): (Arc<Exchange>, SharedLine),
         mut head: ResponseHead,
         body: Bytes,
         closes: bool,
-    ) -> Response<Output> {
+    ) -> Response<ResponseBody> {
         if closes {
             head.headers.insert(CONNECTION, HeaderValue::from_static("close"));
         }
         let content = if body.is_empty() { Content::Ended } else { Content::Whole(Some(body)) };
-        response(head, Output { exchange, line, content })
+        response(head, ResponseBody { exchange, line, content })
     }
 
     pub(super) fn stream(
         (exchange, line): (Arc<Exchange>, SharedLine),
         head: ResponseHead,
-    ) -> Response<Output> {
-        response(head, Output { exchange, line, content: Content::Stream })
+    ) -> Response<ResponseBody> {
+        response(head, ResponseBody { exchange, line, content: Content::Stream })
     }
 }
 
-fn response(head: ResponseHead, output: Output) -> Response<Output> {
-    let mut response = Response::new(output);
+fn response(head: ResponseHead, body: ResponseBody) -> Response<ResponseBody> {
+    let mut response = Response::new(body);
     *response.status_mut() = head.status;
     *response.headers_mut() = head.headers;
     response
 }
 
-impl Body for Output {
+impl Body for ResponseBody {
     type Data = Bytes;
     type Error = Abandoned;
 
@@ -89,7 +89,7 @@ impl Body for Output {
     }
 }
 
-impl Drop for Output {
+impl Drop for ResponseBody {
     fn drop(&mut self) {
         // In a response to HEAD, hyper drops the body without polling it.
         let is_complete = !matches!(self.content, Content::Stream);
