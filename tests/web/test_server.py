@@ -51,6 +51,14 @@ def test_the_server_runs_without_uvloop(monkeypatch: pytest.MonkeyPatch) -> None
     assert loop_of_a_handler() == "asyncio"
 
 
+def test_a_grace_that_is_no_time_is_refused() -> None:
+    options: dict[str, Any] = {"sources": [], "max_connections": 1, "refusals": []}
+    with closing(listen("127.0.0.1", 0)) as listener:
+        for grace in (-1, float("nan")):
+            with pytest.raises(ValueError, match="grace"):
+                HttpServer("x", listener, grace=grace, request_timeout=1, idle_timeout=1, **options)
+
+
 def test_a_server_that_could_not_start_starts_later() -> None:
     resource = pytest.importorskip("resource", reason="Windows has no limit of open files")
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)

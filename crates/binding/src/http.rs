@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 use std::net::TcpListener;
 use std::sync::{Arc, Mutex};
-use std::time::Duration;
 
 use bytes::Bytes;
 use holdfast_engine::http::{
@@ -18,7 +17,7 @@ use pyo3::intern;
 use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyBytes, PyDict, PyList, PyTuple};
 
-use crate::arguments::{address, network, os_error, os_text, time_to_wait};
+use crate::arguments::{address, network, os_error, os_text, seconds, time_to_wait};
 use crate::engine::event_fields;
 use crate::exchange::{Answers, Headers, HttpExchange, request, response_head};
 use crate::heartbeat;
@@ -107,11 +106,7 @@ impl HttpServer {
         let settings = HttpSettings {
             name,
             sources: sources.iter().map(|text| network(text)).collect::<PyResult<_>>()?,
-            limits: ConnectionLimits {
-                max_handshakes,
-                grace: Duration::from_secs_f64(grace),
-                ..limits
-            },
+            limits: ConnectionLimits { max_handshakes, grace: seconds("grace", grace)?, ..limits },
             request_timeout: time_to_wait("request_timeout", request_timeout)?,
             idle_timeout: time_to_wait("idle_timeout", idle_timeout)?,
             leaving,
