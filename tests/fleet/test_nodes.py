@@ -750,7 +750,8 @@ def test_times_of_subscriptions_that_ended_are_forgotten(
 def test_one_node_or_all_are_shut_down(node: Callable[..., Running], caller: Caller) -> None:
     one, two = node("a"), node("b")
     share(one, two)
-    caller.publish("modbus.shutdown", {"node": "nobody"})
+    for payload in ({"node": "nobody"}, {"Node": "a"}, {"node": "a", "force": True}, {}):
+        caller.publish("modbus.shutdown", payload)
     caller.publish("modbus.shutdown", {"node": "a"})
     wire.until(one.ended.done, "the node ends")
     share(two)

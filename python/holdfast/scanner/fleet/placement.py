@@ -16,7 +16,7 @@ from holdfast.scanner.fleet.agreement import Terms
 from holdfast.scanner.fleet.member import FleetMember
 from holdfast.scanner.fleet.nodes import NodeAnswers, OtherNodes, subject
 from holdfast.scanner.fleet.reports import FleetReports
-from holdfast.scanner.messages.types import Answer, FleetReport
+from holdfast.scanner.messages.types import Answer, FleetReport, ShutdownRequest
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -87,11 +87,11 @@ class FleetPlacement(FleetMember):
         if not payload.strip():
             return True
         try:
-            node = msgspec.json.decode(payload, type=dict[str, str]).get("node")
+            node = msgspec.json.decode(payload, type=ShutdownRequest).node
         except MALFORMED_JSON as error:
             log_lines.refused("message_malformed", kind="shutdown", reason=str(error))
             return False
-        return node in (None, self.fleet.node)
+        return node == self.fleet.node
 
     @property
     def writes_heartbeat(self) -> bool:

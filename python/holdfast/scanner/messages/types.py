@@ -147,6 +147,12 @@ class VariablesRequest(Request):
     """The number of tags to skip."""
 
 
+class ShutdownRequest(Request):
+    """Ends one node of a fleet."""
+
+    node: str
+
+
 class Answer(_Message, omit_defaults=True):
     """The answer to a request."""
 
