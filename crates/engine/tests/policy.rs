@@ -60,7 +60,7 @@ fn the_first_rule_that_names_peer_and_unit_decides() {
     assert_eq!((allowed(1), allowed(2)), (vec![3, 6], vec![4]));
     // A unit that the peer does not have shows what it may do elsewhere.
     assert_eq!(allowed(3), [3, 4, 6]);
-    assert!(!rights.is_read_only(1) && rights.is_read_only(2) && !rights.is_read_only(3));
+    assert!(!rights.is_read_only(1) && rights.is_read_only(2) && rights.is_read_only(3));
     let other = policy.rights(peer("10.0.0.8"), None).unwrap();
     assert!(!other.allows(1, 6) && other.allows(1, 1));
     assert!(Arc::ptr_eq(&rights, &policy.rights(peer("10.0.0.7"), None).unwrap()));

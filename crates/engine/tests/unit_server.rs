@@ -21,6 +21,7 @@ const READ: &[u8] = &[3, 0, 0, 0, 1];
 const WRITE: &[u8] = &[6, 0, 0, 0x12, 0x34];
 const LISTEN_ONLY: &[u8] = &[8, 0, 4, 0, 0];
 const RESTART: &[u8] = &[8, 0, 1, 0, 0];
+const CLEAR_COUNTERS: &[u8] = &[8, 0, 10, 0, 0];
 
 fn memory(registers: u32) -> Arc<Memory> {
     let span = Span::new(0, registers).unwrap();
@@ -403,6 +404,32 @@ fn a_peer_learns_nothing_of_units_by_a_function_that_it_does_not_have() {
         let refused = [function[0] | 0x80, 1];
         assert_eq!(ask(&unit_server, &plain, 7, function).unwrap(), refused);
         assert_eq!(ask(&unit_server, &plain, 9, function).unwrap(), refused);
+    }
+}
+
+#[test]
+fn a_peer_learns_nothing_of_units_by_a_sub_function_that_it_does_not_have() {
+    let (memory, unit_server) = (memory(1), unit_server());
+    for (functions, code) in [(Functions::Except(vec![8]), 1), (Functions::Only(vec![8]), 0x0B)] {
+        let own = Narrowed {
+            access: AccessMode::ReadWrite,
+            functions,
+            ranges: Ranges::new(None, None),
+            exception_status: None,
+            queues: Box::default(),
+        };
+        let rights = PeerRights::new(&Rule {
+            sources: Vec::new(),
+            roles: None,
+            units: vec![(7, Arc::clone(&memory)), (8, Arc::clone(&memory))],
+            elsewhere: Vec::new(),
+            access: AccessMode::ReadOnly,
+            functions: Functions::All,
+            narrowed: vec![(7, own)],
+        });
+        assert_eq!(ask(&unit_server, &rights, 8, CLEAR_COUNTERS).unwrap(), [0x88, 1]);
+        assert_eq!(ask(&unit_server, &rights, 9, CLEAR_COUNTERS).unwrap(), [0x88, code]);
+        assert_eq!(ask(&unit_server, &rights, 9, &[8, 0, 0, 0, 0]).unwrap(), [0x88, 0x0B]);
     }
 }
 

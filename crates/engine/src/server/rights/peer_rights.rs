@@ -165,6 +165,7 @@ impl PeerRights {
 
     /// The exception for a request that the peer may not send to this unit: its function is not allowed (writes
     /// are not, for a peer that may only read), or its sub-function is unknown, or changes what it may only read.
+    /// A unit that the peer does not have allows what any of its units allows.
     #[inline]
     pub(crate) fn refusal(
         &self,
@@ -172,10 +173,15 @@ impl PeerRights {
         (function_code, pdu): (u8, &[u8]),
         request: &Result<Request<'_>, ExceptionCode>,
     ) -> Option<ExceptionCode> {
+        let may_change = |unit: &UnitRights| {
+            unit.access == AccessMode::ReadWrite && unit.functions.has(function_code)
+        };
         let changes_state = || {
             function_code == Function::Diagnostics.code()
-                && self.is_read_only(unit_id)
                 && SubFunction::from_pdu(pdu).is_some_and(SubFunction::changes_state)
+                && !self
+                    .unit(unit_id)
+                    .map_or_else(|| self.units.iter().flatten().any(may_change), may_change)
         };
         let refused = !self.allows(unit_id, function_code)
             || *request == Err(ExceptionCode::IllegalFunction)
@@ -224,12 +230,8 @@ impl PeerRights {
         functions.has(function_code)
     }
 
-    /// Whether a peer may not write to a unit; for a unit that it does not have, whether to none.
+    /// Whether a peer may not write to a unit.
     pub fn is_read_only(&self, unit_id: u8) -> bool {
-        let is_read_only = |unit: &UnitRights| unit.access == AccessMode::ReadOnly;
-        match self.unit(unit_id) {
-            Some(unit) => is_read_only(unit),
-            None => self.units.iter().flatten().all(is_read_only),
-        }
+        self.unit(unit_id).is_none_or(|unit| unit.access == AccessMode::ReadOnly)
     }
 }
