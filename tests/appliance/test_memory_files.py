@@ -274,7 +274,8 @@ class Plant:
             with urllib.request.urlopen(request, timeout=wire.DEADLINE) as answer:
                 return answer.status, json.load(answer)["status"]
         except urllib.error.HTTPError as error:
-            return error.code, json.load(error)["reason"]
+            self.refusal = json.load(error)
+            return error.code, self.refusal["reason"]
 
     def packet(self, value: int) -> bytes:
         with socket.create_connection(("127.0.0.1", self.port("sender"))) as sender:
@@ -333,6 +334,11 @@ def test_with_a_full_disk_no_write_is_confirmed_and_none_is_carried_out(plant: P
 
 @pytest.mark.parametrize("plant", [0], indirect=True)
 def test_a_batch_is_one_step_or_none(plant: Plant) -> None:
+    assert plant.rest(("volatile", 1), ("plant", 1)) == (400, "not_one_step")
+    assert plant.refusal["detail"] == (
+        "commands[0]: volatile and other memories of the batch are not kept together, "
+        "so no step writes all of them"
+    )
     assert plant.rest(("plant", 1), ("volatile", 1)) == (400, "not_one_step")
     assert plant.rest(("plant", 1), ("plant", 2)) == (200, "accepted")
     assert plant.modbus("0300030001") == "03020002"

@@ -547,7 +547,7 @@ class MemoryAccess:
                 detail = "a range mirrors a device, and its values are too old"
                 return refusal("stale", detail, place)
             case "not_one_step":
-                detail = f"{memory} and the memories before it are not kept together"
+                detail = f"{memory} and other memories of the batch are not kept together"
                 detail += ", so no step writes all of them"
                 return refusal("not_one_step", detail, place)
             case "too_large":
