@@ -205,6 +205,12 @@ def test_a_value_that_json_does_not_have_is_refused_in_words(memory_access: Memo
     assert found.detail.startswith('commands[0]: values[1] is "<object object at ')
 
 
+def test_text_that_is_not_utf_8_is_refused_without_a_position(memory_access: MemoryAccess) -> None:
+    with pytest.raises(Refused) as caught:
+        memory_access.ingest(b'{"memory": "plant\xff"}', GRANT, "-")
+    assert caught.value.detail == "not JSON: a string is not UTF-8"
+
+
 def test_reasons_beyond_a_limit_are_counted_together(memory_access: MemoryAccess) -> None:
     """An adapter of another package may make its reasons from what it receives."""
     for number in [*range(100), 0, 99]:

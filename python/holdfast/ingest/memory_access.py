@@ -34,7 +34,7 @@ from holdfast.ingest.refusals import (
     unrecorded,
 )
 from holdfast.protocol import EXCEPTIONS, MAX_WORD
-from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.types import AREAS, BIT_AREAS
 
 if TYPE_CHECKING:
@@ -613,7 +613,7 @@ def _decoded(body: bytes | bytearray | memoryview) -> object:
     try:
         return _DOCUMENT.decode(body)
     except MALFORMED_JSON as error:
-        raise Refused("malformed", f"not JSON: {error}") from None
+        raise Refused("malformed", f"not JSON: {malformed_text(error)}") from None
 
 
 def _keys_wrong(command: Mapping[str, object]) -> str:

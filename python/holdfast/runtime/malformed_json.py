@@ -6,3 +6,9 @@ import msgspec
 
 MALFORMED_JSON = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 """What msgspec raises: for other forms, for a text that is not UTF-8, and for deep nesting."""
+
+
+def malformed_text(error: Exception) -> str:
+    """Returns what is wrong, for people."""
+    # The position in the error counts from the start of the string, not of the document.
+    return "a string is not UTF-8" if isinstance(error, UnicodeDecodeError) else str(error)

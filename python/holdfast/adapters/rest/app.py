@@ -31,6 +31,7 @@ from holdfast.net.http.requests import (
     response,
     shown,
 )
+from holdfast.runtime.malformed_json import malformed_text
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterable, Mapping
@@ -209,7 +210,7 @@ class App(Application):
             request_body = msgspec.json.decode(body, type=EndSession)
             listener, number = parse_session_id(request_body.id)
         except ValueError as error:
-            raise malformed(str(error)) from None
+            raise malformed(malformed_text(error)) from None
         by = {"listener": "rest", "peer": request.peer, "source": request.who}
         if not await asyncio.to_thread(self._sessions.end_session, listener, number, by):
             raise BadRequest("unknown_session", f"no session {shown(request_body.id)}")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.dialects.tentacle import utf8_text
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.subject_parts import tentacle_next_name
@@ -123,7 +123,7 @@ class TentacleNext:
         except msgspec.ValidationError as error:
             raise Refused(f"{error}, {COMMAND_FORM}") from None
         except MALFORMED_JSON as error:
-            raise Refused(f"not JSON: {error}; {COMMAND_FORM}") from None
+            raise Refused(f"not JSON: {malformed_text(error)}; {COMMAND_FORM}") from None
         if value is None or type(value) is dict:
             found = "null" if value is None else "an object"
             raise Refused(f"the value is {found}, allowed: numbers, booleans, texts and arrays")

@@ -14,7 +14,7 @@ from nats.errors import Error
 
 from holdfast.events import log_lines
 from holdfast.replication.leases.bucket import KeyBucket, Outdated
-from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms
 
 if TYPE_CHECKING:
@@ -251,8 +251,9 @@ class DesiredState:
             if value:
                 msgspec.json.decode(value, type=DesiredDevice)
         except MALFORMED_JSON as error:
-            fields = {"bucket": self.bucket, "key": DEVICE + _token(device), "reason": str(error)}
-            log_lines.refused("kept_entry_malformed", kind="fleet", **fields)
+            fields = {"bucket": self.bucket, "key": DEVICE + _token(device)}
+            reason = malformed_text(error)
+            log_lines.refused("kept_entry_malformed", kind="fleet", **fields, reason=reason)
             return b""
         return value
 

@@ -11,7 +11,7 @@ from holdfast import _core
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import Broker
 from holdfast.net.nats.outbox import Outbox
-from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.fleet.agreement import Terms
 from holdfast.scanner.fleet.member import FleetMember
 from holdfast.scanner.fleet.nodes import NodeAnswers, OtherNodes, subject
@@ -89,7 +89,7 @@ class FleetPlacement(FleetMember):
         try:
             node = msgspec.json.decode(payload, type=ShutdownRequest).node
         except MALFORMED_JSON as error:
-            log_lines.refused("message_malformed", kind="shutdown", reason=str(error))
+            log_lines.refused("message_malformed", kind="shutdown", reason=malformed_text(error))
             return False
         return node == self.fleet.node
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Protocol
 import msgspec
 
 from holdfast.events import log_lines
-from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.entry_subscriptions import EntryHost, EntrySubscriptions
 from holdfast.scanner.jetstream.key_watch import KeyWatch
@@ -63,8 +63,9 @@ class EnabledKey:
         try:
             enabled = written is None or msgspec.json.decode(written.value, type=_State).enabled
         except MALFORMED_JSON as error:
+            reason = malformed_text(error)
             log_lines.refused(
-                "enabled_entry_malformed", kind="enabled", key=self._key, reason=str(error)
+                "enabled_entry_malformed", kind="enabled", key=self._key, reason=reason
             )
             return
         if enabled != self.enabled:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from holdfast.events import log_lines
-from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.availability import MAX_RETRY_S
 from holdfast.scanner.jetstream.entries import (
@@ -138,7 +138,8 @@ class StoredSubscriptions(Placement):
                     continue
                 request = restored(value)
             except (Refused, *MALFORMED_JSON) as error:
-                log_lines.refused("kept_entry_malformed", kind="kept", key=key, reason=str(error))
+                reason = malformed_text(error)
+                log_lines.refused("kept_entry_malformed", kind="kept", key=key, reason=reason)
                 continue
             owner = SubscriptionKey.of(request)
             is_ours = owner in self._store.touched or self._is_known(owner)

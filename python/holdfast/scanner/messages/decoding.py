@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar, get_args
 import msgspec
 
 from holdfast.config.values.scanner_settings import Publish
-from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.runtime.text import clip, quote
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.types import (
@@ -170,7 +170,7 @@ def _exact(data: bytes, kind: type[Decoded]) -> Decoded:
         except msgspec.ValidationError:
             return _converted(msgspec.json.decode(data), kind)
     except MALFORMED_JSON as error:
-        raise Refused(f"not JSON: {error}") from None
+        raise Refused(f"not JSON: {malformed_text(error)}") from None
 
 
 def _converted(value: Any, kind: type[Decoded]) -> Decoded:
