@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.gateway.app import SHORT_BYTES
 from holdfast.gateway.endpoints import request_tags
 from holdfast.tags import Tag, TagList
 from support import gateways, web, wire
@@ -306,6 +305,9 @@ def test_hostile_lists_are_refused(gateway: Running, text: str, says: str | None
     assert says is None or says in answer.json["error"]
 
 
+LONG = request_tags.SHORT_SIZE + 1
+
+
 class Parser:
     """Parses tag lists in place of the gateway, once a test lets it."""
 
@@ -315,7 +317,7 @@ class Parser:
 
     def __call__(self, text: str, is_csv: bool) -> TagList:  # noqa: ARG002
         self.begun.append(text)
-        assert self.resume.wait(wire.DEADLINE)
+        assert self.resume.wait(2 * wire.DEADLINE)
         return PROFILE
 
 
@@ -352,15 +354,30 @@ def until_pending(gateway: Running, count: int) -> None:
 def test_addresses_take_turns_with_their_lists(
     parser: Parser, post: Callable[..., wire.Connection]
 ) -> None:
-    texts = [f"{name:<{SHORT_BYTES}}" for name in ("a1", "a2", "a3")]
-    waiting = [post(text, pending=at) for at, text in enumerate(texts, 1)]
-    waiting.append(post("b1", "127.0.0.2", pending=4))
-    waiting.append(post("short", pending=5))
+    texts = [f"{name:<{LONG}}" for name in ("a1", "a2", "a3", "b1")]
+    sources = None, None, None, "127.0.0.2"
+    waiting = [
+        post(text, source, pending=at)
+        for at, (text, source) in enumerate(zip(texts, sources, strict=True), 1)
+    ]
     parser.resume.set()
     for connection in waiting:
         [answer] = web.answers(connection.rest())
         assert answer.status == 200
-    assert [text.strip() for text in parser.begun] == ["a1", "b1", "short", "a2", "a3"]
+    assert [text.strip() for text in parser.begun] == ["a1", "b1", "a2", "a3"]
+
+
+def test_short_and_known_lists_do_not_wait_for_the_long_list_of_another_address(
+    gateway: Running, post: Callable[..., wire.Connection], request: pytest.FixtureRequest
+) -> None:
+    known = {"tags": f"{'tags: {a: {area: coils, address: 0}}':<{LONG}}"}
+    assert local(gateway, "/tags", known).status == 200
+    parser = request.getfixturevalue("parser")
+    post(f"{'long':<{LONG}}", "127.0.0.2", pending=1)
+    wire.until(lambda: parser.begun, "the long list is being parsed")
+    assert local(gateway, "/tags", known).status == 200
+    post("short", pending=2)
+    wire.until(lambda: parser.begun[1:] == ["short"], "the short list is being parsed")
 
 
 def test_the_list_of_a_client_that_has_gone_is_not_parsed(

@@ -21,6 +21,7 @@ from holdfast.gateway.broadcast import NOTE
 from holdfast.gateway.device import Failed, RequestedDevice
 from holdfast.gateway.egress import Egress
 from holdfast.gateway.endpoints import address_map
+from holdfast.gateway.endpoints.request_tags import SHORT_SIZE
 from holdfast.gateway.pool import Pool
 from holdfast.gateway.refusals import EXCEPTION_STATUS, FAILURE, REFUSALS
 from holdfast.gateway.shared_devices import Shared
@@ -65,9 +66,6 @@ REASON = b"holdfast-reason"
 EXCEPTION = b"holdfast-exception"
 FORM = b"application/x-www-form-urlencoded"
 """The default Content-Type of `curl -d`. The gateway treats it as JSON."""
-
-SHORT_BYTES = 8192
-"""Requests up to this size don't wait until the longer ones of their address are parsed."""
 
 STOPPING = "the gateway is stopping"
 HOSTS = "--host, or hosts in the configuration"
@@ -407,7 +405,7 @@ class App(Application):
 
     async def _parsed(self, request: Request, parse: Parse[Result], given: Given) -> Result:
         """Parses what a request has; of each address, one long and one short at a time."""
-        is_long = len(request.whole or b"") > SHORT_BYTES
+        is_long = len(request.whole or b"") > SHORT_SIZE
 
         async def in_turn() -> Result:
             async with self._parsing.of((host_of(request.peer), is_long)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
+from weakref import WeakValueDictionary
 
 from holdfast import values
 from holdfast.config import ConfigError
@@ -33,6 +34,8 @@ MAX_VALUES = 20_000
 MAX_PROBLEMS = 10
 """The most problems of a tag list that an answer names."""
 MAX_TEXT = 65536
+SHORT_SIZE = 8192
+"""Requests and tag lists up to this size don't wait until longer ones are parsed."""
 MAX_PARSED = 16
 """Parsed lists that are kept, because clients send their list with each request. Each takes up to
 2 MB."""
@@ -63,7 +66,9 @@ VALUE = Field(
 )
 LIST = (TEXT, FORMAT, PROFILE)
 
-_PARSER = OwnThread("holdfast-tag-lists")
+_SHORT, _LONG = OwnThread("holdfast-short-tag-lists"), OwnThread("holdfast-long-tag-lists")
+_KNOWN: WeakValueDictionary[tuple[str, bool], TagList] = WeakValueDictionary()
+"""The parsed lists: requests with one of them wait for no thread."""
 
 
 async def tags_of(given: Given, profiles: Mapping[str, TagList]) -> TagList:
@@ -73,7 +78,9 @@ async def tags_of(given: Given, profiles: Mapping[str, TagList]) -> TagList:
         raise malformed("one of tags and profile is required")
     if profile is None:
         # Parsing a long list takes a second, in which other requests are answered.
-        return await _PARSER.call(partial(_parsed, text, given["format"] == "csv"))
+        parser = _LONG if len(text) > SHORT_SIZE else _SHORT
+        key = text, given["format"] == "csv"
+        return _KNOWN.get(key) or await parser.call(partial(_parsed, *key))
     if profile not in profiles:
         known = listing(profiles) or "none, the configuration has no profiles"
         hint = suggestion(profile, profiles)
@@ -95,6 +102,7 @@ def _parsed(text: str, is_csv: bool) -> TagList:
     if items > MAX_ITEMS:
         found = f"{items} bits, registers and states"
         raise malformed(f"tags: found {found}, allowed: up to {MAX_ITEMS}")
+    _KNOWN[text, is_csv] = tags
     return tags
 
 
