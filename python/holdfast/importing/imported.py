@@ -122,8 +122,8 @@ class Source:
         return elsewhere
 
     def _look_at(self, path: KeyPath, value: object) -> None:
-        self.desk.broken = {each.key for each in self.problems}
         self._refuse_other_bases(path, value)
+        self.desk.broken = {each.key for each in self.problems + self.desk.report.problems}
         for repeated, line in self.desk.document.repeated:
             if all(one == other for one, other in zip(path, repeated, strict=False)):
                 message = f"line {line} has it, too: the last counts, as in the source"

@@ -191,15 +191,18 @@ class Section:
 
     def _present(self, key: str | int, allowed: str, required: bool) -> Any:
         value = self.get(key)
-        if self.desk.document.spell(self.at(key)) in self.desk.broken:
+        if self._is_broken(key):
             return None
         if value is None and required:
             self.problem_of_key(key, f"missing, allowed: {allowed}")
         return value
 
     def _wrong(self, key: str | int, value: object, allowed: str) -> None:
-        if value is not None:
+        if value is not None and not self._is_broken(key):
             self.problem(key, f"found {show(value)}, allowed: {allowed}")
+
+    def _is_broken(self, key: str | int) -> bool:
+        return self.desk.document.spell(self.at(key)) in self.desk.broken
 
 
 def section(desk: Desk, path: KeyPath, value: object) -> Section | None:
