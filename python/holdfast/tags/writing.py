@@ -11,7 +11,7 @@ from holdfast.tags.scale import RegisterScale, ScaledTag, is_finite
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
 from holdfast.values.errors import shown
-from holdfast.values.numeric import nearest_float, round_to_odd
+from holdfast.values.numeric import nearest_float
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -115,7 +115,7 @@ class WritableTag(ScaledTag):
         if self._linear.is_identity:
             return value
         try:
-            return round_to_odd(self._linear.number(value), self.of_type.base)
+            return nearest_float(self._linear.number(value), self.of_type.base)
         except OverflowError:
             raise DoesNotFit(f"{value} does not fit {self.type}") from None
 
