@@ -394,7 +394,10 @@ def test_an_argument_that_can_not_be_is_a_value_error(
         ({"identity": "x"}, "identity is 'x', allowed: holdfast.server.Identity(vendor_name=…)"),
         ({"keepalive": 2.5}, "keepalive is 2.5, allowed: an integer"),
         ({"max_connections": True}, "max_connections is True, allowed: an integer"),
-        ({"max_connections_per_source": "4"}, "max_connections_per_source is '4', allowed: an int"),
+        (
+            {"max_connections_per_source": 2.0},
+            "max_connections_per_source is 2.0, allowed: an integer, None",
+        ),
         ({"idle_timeout": "1"}, "idle_timeout is '1', allowed: a number of seconds"),
         ({"request_timeout": None}, "request_timeout is None, allowed: a number of seconds"),
         ({"when_full": None}, "when_full is None, allowed: refuse, evict"),

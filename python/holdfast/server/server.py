@@ -260,7 +260,7 @@ def _other_type(name: str, value: object) -> str | None:
         return None if is_number else "a number of seconds"
     if isinstance(default, str):
         return None if isinstance(value, str) else "refuse, evict"
-    return None if as_integer(value) is not None else "an integer"
+    return None if as_integer(value) is not None else f"an integer{', None' * (default is None)}"
 
 
 def _check_line(scheme: str, units: Collection[int], sources: Sequence[str]) -> None:
