@@ -1054,6 +1054,37 @@ def test_an_entity_ends_with_its_area(imported: Callable[..., Imported]) -> None
         imported("sensors: [{name: x, address: 65535, data_type: uint32}]")
 
 
+def test_a_name_that_is_a_topic_does_not_depend_on_the_other_entities(
+    imported: Callable[..., Imported],
+) -> None:
+    switches = [
+        "{name: Насос, address: 5, slave: 1, write_type: coil, verify: }",
+        "{name: Котёл, address: 6, slave: 1, write_type: coil, verify: {address: 9}}",
+        "{name: Вентилятор, address: 7, slave: 1, write_type: coil, unique_id: fan}",
+        "{name: Główny, address: 8, slave: 1, command_on: 1}",
+        "{name: Główna, address: 8, slave: 1, command_on: 2}",
+        "{name: Außen, address: 9, slave: 1}",
+        "{name: Pump, address: 10, slave: 1, unique_id: pump}",
+        "{name: pump, address: 11, slave: 1, unique_id: pump}",
+    ]
+    found = imported(f"switches: [{', '.join(switches)}]")
+    names = ["coil_5", "coil_6", "coil_9_state", "fan"]
+    names += ["holding_register_8_a94c9379", "holding_register_8_ba200b2f", "aussen"]
+    assert list(tags(found)) == [*names, "holding_register_10", "holding_register_11"]
+    assert tags(found)["coil_6"]["description"] == "Котёл"
+    key = "8: modbus[0].switches"
+    assert [note for note in notes(found) if "renamed" in note][5:] == [
+        f"{key}[4].name: changed: renamed to {names[5]}: a name has letters from a to z, digits "
+        "and '_'",
+        f"{key}[6].name: changed: renamed to holding_register_10: another entity has its name",
+        f"{key}[7].name: changed: renamed to holding_register_11: another entity has its name",
+    ]
+    for gone in range(len(switches)):
+        rest = [each for index, each in enumerate(switches) if index != gone]
+        for name, tag in tags(imported(f"switches: [{', '.join(rest)}]")).items():
+            assert tags(found).get(name, tag) == tag
+
+
 def test_details_that_mean_something_else_elsewhere(imported: Callable[..., Imported]) -> None:
     found = imported(
         "sensors: [{name: count, address: 1, count: 2}, "

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
+from zlib import crc32
 
 from holdfast.config.text.messages import show
 from holdfast.importing.key_reader import Section
@@ -42,6 +44,8 @@ _ORDERS = {"none": None, "word": "CDAB", "byte": "BADC", "word_byte": "DCBA"}
 _LITTLE_ORDERS = {"none": "DCBA", "word": "BADC", "byte": "CDAB", "word_byte": None}
 """The byte orders by `swap`; of structures whose values have their last byte first."""
 
+_NAME_FORM = "a name has letters from a to z, digits and '_'"
+
 _UTF_8 = {"encoding": "utf-8"}
 """The source decoded every text as UTF-8."""
 
@@ -63,27 +67,76 @@ _MODES = ("hvac_mode_register", "fan_mode_register", "swing_mode_register")
 
 
 @dataclass
+class Wanted:
+    """A tag whose name is chosen when all tags of its unit are known."""
+
+    name: str
+    """As an entity id; empty if that can't spell it."""
+    instead: list[str]
+    """Names for a tag whose own is empty, or that of another one, too: none depends on others."""
+    tag: dict[str, Any]
+    description: str
+    at: KeyPath
+
+
+@dataclass
 class Places:
-    """The tags of one device so far."""
+    """The tags of one unit so far."""
 
     desk: Desk
-    tags: dict[str, dict[str, Any]] = field(default_factory=dict)
+    tags: list[Wanted] = field(default_factory=list)
     at: KeyPath = ()
     """The place of the entity that is being read."""
+    name: str = ""
+    unique_id: object = None
+    """Both of that entity."""
     written: dict[bool, list[KeyPath]] = field(default_factory=lambda: {False: [], True: []})
     """What writes one coil or register, with functions 5 and 6, or (`True`) with 15 and 16."""
 
+    def begin(self, entity: Section) -> None:
+        """The tags that are added from now on are those of this entity."""
+        self.at, self.name = entity.path, _name(entity)
+        self.unique_id = entity.data.get("unique_id")
+
     def add(self, name: str, area: Area, address: int, **settings: Any) -> None:
         """Adds a tag; its name is that of an entity id, and `name` its description."""
-        plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower()
-        wanted = re.sub(r"[^a-z0-9]+", "_", plain).strip("_")[:MAX_LENGTH] or "entity"
         tag = {"area": area, "address": address, **settings}
-        key = free_name(wanted, set(self.tags))
         size = register_count(settings["type"]) if "type" in settings else 1
         if address + size > ADDRESSES:
             message = f"{name} is at {address} to {address + size - 1}"
             self.desk.problem(self.at, f"{message}, allowed: up to {LAST_ADDRESS}")
-        self.tags[key] = tag if key == name else {**tag, "description": name}
+        part = name.removeprefix(self.name)
+        place = _spelt(f"{area.removesuffix('s')} {address}{part}")
+        instead = [place, f"{place[: MAX_LENGTH - 9]}_{crc32(name.encode()):08x}"]
+        if self.unique_id is not None and (spelt := _spelt(f"{self.unique_id}{part}")):
+            instead.insert(0, spelt)
+        self.tags.append(Wanted(_spelt(name), instead, tag, name, self.at))
+
+    def named(self) -> dict[str, dict[str, Any]]:
+        """The tags by name, whatever the order of their entities: a name is a topic to write to."""
+        wanted = Counter(each.name for each in self.tags if each.name)
+        others = [each for each in self.tags if wanted[each.name] != 1]
+        instead = Counter(name for each in others for name in each.instead)
+        tags: dict[str, dict[str, Any]] = {}
+        for each in self.tags:
+            name = each.name
+            if wanted[name] != 1:
+                free = (name for name in each.instead if instead[name] == 1 and not wanted[name])
+                name = next(free, None) or free_name(each.instead[-1], {*wanted, *tags})
+                reason = "another entity has its name" if each.name else _NAME_FORM
+                self.desk.changed((*each.at, "name"), f"renamed to {name}: {reason}")
+            is_plain = name == each.description
+            tags[name] = each.tag if is_plain else {**each.tag, "description": each.description}
+        return tags
+
+
+def _spelt(text: str) -> str:
+    """The text as an entity id; empty if a letter would be missing."""
+    plain = unicodedata.normalize("NFKD", text.casefold())
+    if any(each.isalnum() and not each.isascii() for each in plain):
+        return ""
+    plain = plain.encode("ascii", "ignore").decode()
+    return re.sub(r"[^a-z0-9]+", "_", plain).strip("_")[:MAX_LENGTH]
 
 
 Entities: TypeAlias = Callable[[Places, "Section"], None]

@@ -210,7 +210,7 @@ class _Unit:
             self.places.desk.changed(path, message)
         # The source read each entity alone: registers between them may not exist.
         settings = {"unit": number, "interval": interval, "timeout": timeout, "max_gap": 0}
-        return {**settings, "tags": self.places.tags}
+        return {**settings, "tags": self.places.named()}
 
 
 @dataclass
@@ -285,7 +285,7 @@ class _Hub:
         interval = entity.integer("scan_interval", 0, 86_400, what="seconds")
         known = len(unit.places.tags)
         if entity.text("name", required=True) is not None:
-            unit.places.at = entity.path
+            unit.places.begin(entity)
             convert(unit.places, entity)
         if len(unit.places.tags) == known:
             pass  # What is left out is not polled.
