@@ -532,15 +532,18 @@ def test_each_unit_id_of_a_hub_is_a_device_with_its_own_interval(
         "sensors: [{name: a, address: 1, slave: 1, scan_interval: 30}, "
         "{name: b, address: 2, device_address: 2, scan_interval: 5}, "
         "{name: c, address: 3, slave: 1, scan_interval: 10}, {name: d, address: 4}, "
-        "{name: left out, address: 5, slave: 1, scan_interval: 1, scale: 0}]"
+        "{name: left out, address: 5, slave: 1, scan_interval: 1, scale: 0}, "
+        "{name: e, address: 6, slave: 1, scan_interval: 0}]"
     )
     devices = found.data["devices"]
-    assert {name: (d["unit"], d["interval"]) for name, d in devices.items()} == {
-        "inverter-1": (1, 10),
-        "inverter-2": (2, 5),
+    assert {name: (d["unit"], d["interval"], list(d["tags"])) for name, d in devices.items()} == {
+        "inverter-1": (1, 10, ["e", "c"]),
+        "inverter-1-15s": (1, 15, ["d"]),
+        "inverter-1-30s": (1, 30, ["a"]),
+        "inverter-2": (2, 5, ["b"]),
     }
-    message = "polled every 10 s, as the whole device; it was 30 s, and 1 more"
-    assert f"8: modbus[0].sensors[0].scan_interval: changed: {message}" in notes(found)
+    message = "changed: entities polled every 15 s are tags of inverter-1-15s"
+    assert f"8: modbus[0].sensors[3]: {message}" in notes(found)
 
 
 def test_a_serial_line_and_pauses_are_in_the_url(imported: Callable[..., Imported]) -> None:
@@ -1135,7 +1138,8 @@ def test_actions_that_write_are_noted_with_what_replaces_them(
 ) -> None:
     hub = HUB.replace("automation: !include automations.yaml\n", "")
     found = imported(
-        "sensors: [{name: Setpoint, slave: 1, address: 0, scale: 0.1}]\n"
+        "sensors: [{name: Setpoint, slave: 1, address: 0, scale: 0.1}, "
+        "{name: Power, slave: 1, address: 1, scan_interval: 5}]\n"
         "    binary_sensors: [{name: Door, slave: 1, address: 9, input_type: holding}]\n"
         "    switches: [{name: Pump, slave: 2, address: 5, write_type: coil}]\n"
         "automation:\n"
@@ -1160,8 +1164,8 @@ def test_actions_that_write_are_noted_with_what_replaces_them(
     register = "check: modbus.write_register to address"
     assert [note for note in notes(found) if stops in note] == [
         f"12: automation[0].action[0].service: {register} 0 of unit 1 of hub 'inverter' {stops}: "
-        "set writable: true for setpoint of inverter-1, and publish the scaled value to "
-        "plant/inverter-1/setpoint/set (lines 12 and 19)",
+        "set writable: true for setpoint of inverter-1-15s, and publish the scaled value to "
+        "plant/inverter-1-15s/setpoint/set (lines 12 and 19)",
         "14: automation[0].action[1].service_template: check: modbus.write_coil to address '5' of "
         f"unit 2 of hub 'inverter' {stops}: publish the value to plant/inverter-2/pump/set",
         f"20: script.charge.sequence[1].action: {register} '{{{{ a }}}}' of unit 1 of hub "

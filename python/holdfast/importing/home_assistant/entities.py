@@ -77,6 +77,7 @@ class Wanted:
     tag: dict[str, Any]
     description: str
     at: KeyPath
+    interval: int
 
 
 @dataclass
@@ -89,13 +90,14 @@ class Places:
     """The place of the entity that is being read."""
     name: str = ""
     unique_id: object = None
-    """Both of that entity."""
+    interval: int = 0
+    """All three of that entity."""
     written: dict[bool, list[KeyPath]] = field(default_factory=lambda: {False: [], True: []})
     """What writes one coil or register, with functions 5 and 6, or (`True`) with 15 and 16."""
 
-    def begin(self, entity: Section) -> None:
+    def begin(self, entity: Section, interval: int) -> None:
         """The tags that are added from now on are those of this entity."""
-        self.at, self.name = entity.path, _name(entity)
+        self.at, self.name, self.interval = entity.path, _name(entity), interval
         self.unique_id = entity.data.get("unique_id")
 
     def add(self, name: str, area: Area, address: int, **settings: Any) -> None:
@@ -110,14 +112,14 @@ class Places:
         instead = [place, f"{place[: MAX_LENGTH - 9]}_{crc32(name.encode()):08x}"]
         if self.unique_id is not None and (spelt := _spelt(f"{self.unique_id}{part}")):
             instead.insert(0, spelt)
-        self.tags.append(Wanted(_spelt(name), instead, tag, name, self.at))
+        self.tags.append(Wanted(_spelt(name), instead, tag, name, self.at, self.interval))
 
-    def named(self) -> dict[str, dict[str, Any]]:
+    def named(self) -> dict[str, Wanted]:
         """The tags by name, whatever the order of their entities: a name is a topic to write to."""
         wanted = Counter(each.name for each in self.tags if each.name)
         others = [each for each in self.tags if wanted[each.name] != 1]
         instead = Counter(name for each in others for name in each.instead)
-        tags: dict[str, dict[str, Any]] = {}
+        tags: dict[str, Wanted] = {}
         for each in self.tags:
             name = each.name
             if wanted[name] != 1:
@@ -125,8 +127,9 @@ class Places:
                 name = next(free, None) or free_name(each.instead[-1], {*wanted, *tags})
                 reason = "another entity has its name" if each.name else _NAME_FORM
                 self.desk.changed((*each.at, "name"), f"renamed to {name}: {reason}")
-            is_plain = name == each.description
-            tags[name] = each.tag if is_plain else {**each.tag, "description": each.description}
+            if name != each.description:
+                each.tag["description"] = each.description
+            tags[name] = each
         return tags
 
 

@@ -1,6 +1,6 @@
 """Imports the `modbus` section of Home Assistant: entities become tags of devices.
 
-A hub becomes one device for each unit id that its entities name.
+A hub becomes one device for each unit id that its entities name, and for each of their intervals.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from urllib.parse import quote, urlencode
 from holdfast.client.url import parse
 from holdfast.config.text.messages import show
 from holdfast.config.values.scalars import MAX_TIME, MIN_TIME
-from holdfast.importing.home_assistant.entities import PLATFORMS, Entities, Places
+from holdfast.importing.home_assistant.entities import PLATFORMS, Entities, Places, Wanted
 from holdfast.importing.home_assistant.included_files import IncludedFiles
 from holdfast.importing.home_assistant.source_defaults import (
     SCAN_INTERVAL_S,
@@ -146,24 +146,48 @@ def _devices(desk: Desk, hubs: list[Section]) -> dict[str, dict[str, Any]]:
     ]
     names = unique_names(desk, wanted)
     taken, devices = set(names), dict[str, dict[str, Any]]()
-    of_units: dict[tuple[str, int], str] = {}
+    of_units: dict[tuple[str, int], list[str]] = {}
     found = [_Hub(desk, hub) for hub in hubs]
     for read in found:
         read.read()
     _share_connections(desk, found)
     for (_, source_name), name, read in zip(wanted, names, found, strict=True):
-        units = {number: unit for number, unit in read.units.items() if unit.places.tags}
-        for number, unit in units.items():
-            its_name = (
-                name if len(units) == 1 else free_name(f"{name}-{number}"[-MAX_LENGTH:], taken)
-            )
-            taken.add(its_name)
-            of_units[source_name, number] = its_name
-            devices[its_name] = {"url": read.url, **unit.device(number, read.timeout)}
+        units = {number: places for number, places in read.units.items() if places.tags}
+        for number, places in units.items():
+            of_unit = name if len(units) == 1 else f"{name}-{number}"
+            its_names = of_units[source_name, number] = []
+            for interval, tags in _by_interval(places).items():
+                wished = f"{of_unit}-{interval}s" if its_names else of_unit
+                its_name = name if wished == name else free_name(wished[-MAX_LENGTH:], taken)
+                taken.add(its_name)
+                if its_names:
+                    message = f"entities polled every {interval} s are tags of {its_name}"
+                    desk.changed(next(iter(tags.values())).at, message)
+                its_names.append(its_name)
+                # The source read each entity alone: registers between them may not exist.
+                devices[its_name] = {
+                    "url": read.url,
+                    "unit": number,
+                    "interval": interval,
+                    "timeout": read.timeout,
+                    "max_gap": 0,
+                    "tags": {key: each.tag for key, each in tags.items()},
+                }
     if devices:
         _to_check(desk, hubs[0].path)
         note_write_actions(desk, hubs[0].path, of_units, devices)
     return devices
+
+
+def _by_interval(places: Places) -> dict[int, dict[str, Wanted]]:
+    """The tags of a unit, the shortest interval first; 0, for none, is the shortest, too."""
+    tags = places.named()
+    given = (each.interval for each in tags.values() if each.interval)
+    shortest = min(given, default=SCAN_INTERVAL_S)
+    groups: dict[int, dict[str, Wanted]] = {shortest: {}}
+    for key, each in sorted(tags.items(), key=lambda item: item[1].interval):
+        groups.setdefault(each.interval or shortest, {})[key] = each
+    return groups
 
 
 def _share_connections(desk: Desk, hubs: list[_Hub]) -> None:
@@ -193,27 +217,6 @@ def _to_check(desk: Desk, path: KeyPath) -> None:
 
 
 @dataclass
-class _Unit:
-    """The entities of one unit id of a hub."""
-
-    places: Places
-    intervals: list[tuple[KeyPath, int]] = field(default_factory=list)
-
-    def device(self, number: int, timeout: float) -> dict[str, Any]:
-        """The device, without its URL."""
-        interval = min((given for _, given in self.intervals), default=SCAN_INTERVAL_S)
-        others = [(path, given) for path, given in self.intervals if given != interval]
-        if others:
-            path, given = others[0]
-            more = f", and {len(others) - 1} more" if len(others) > 1 else ""
-            message = f"polled every {interval} s, as the whole device; it was {given} s{more}"
-            self.places.desk.changed(path, message)
-        # The source read each entity alone: registers between them may not exist.
-        settings = {"unit": number, "interval": interval, "timeout": timeout, "max_gap": 0}
-        return {**settings, "tags": self.places.named()}
-
-
-@dataclass
 class _Hub:
     """Reads one hub."""
 
@@ -225,7 +228,7 @@ class _Hub:
     """The options of the serial line."""
     tolerance: dict[str, float] = field(default_factory=dict)
     timeout: float = TIMEOUT_S
-    units: dict[int, _Unit] = field(default_factory=dict)
+    units: dict[int, Places] = field(default_factory=dict)
 
     def read(self) -> None:
         hub = self.hub
@@ -260,7 +263,7 @@ class _Hub:
 
     def _choose_functions(self) -> None:
         """Writes all values with functions 15 and 16 if one was: the device has no 5 or 6."""
-        written = [unit.places.written for unit in self.units.values()]
+        written = [places.written for places in self.units.values()]
         if not any(each[True] for each in written):
             return
         self.tolerance["write_multiple"] = 1
@@ -281,20 +284,14 @@ class _Hub:
         if entity.get(key) is None:
             message = f"no slave: unit {UNIT}, as in newer versions; older ones asked 0"
             self.desk.check(entity.path, message)
-        unit = self.units.setdefault(UNIT if number is None else number, _Unit(Places(self.desk)))
+        places = self.units.setdefault(UNIT if number is None else number, Places(self.desk))
         interval = entity.integer("scan_interval", 0, 86_400, what="seconds")
-        known = len(unit.places.tags)
+        known = len(places.tags)
         if entity.text("name", required=True) is not None:
-            unit.places.begin(entity)
-            convert(unit.places, entity)
-        if len(unit.places.tags) == known:
-            pass  # What is left out is not polled.
-        elif interval == 0:
+            places.begin(entity, SCAN_INTERVAL_S if interval is None else interval)
+            convert(places, entity)
+        if interval == 0 and len(places.tags) > known:
             entity.changed("scan_interval", "polled with the others of its device")
-        elif interval is not None:
-            unit.intervals.append((entity.at("scan_interval"), interval))
-        else:
-            unit.intervals.append((entity.path, SCAN_INTERVAL_S))
         entity.close(_ENTITY_REASONS)
 
     def _network(self, kind: str) -> str:

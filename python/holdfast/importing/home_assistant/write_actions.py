@@ -29,12 +29,12 @@ _DATA_KEYS = ("data", "data_template", "service_data")
 def note_write_actions(
     desk: Desk,
     section: KeyPath,
-    of_units: dict[tuple[str, int], str],
+    of_units: dict[tuple[str, int], list[str]],
     devices: dict[str, dict[str, Any]],
 ) -> None:
     """Notes the actions in the file that write, with what replaces them.
 
-    `of_units` has the name of the device of each hub and unit id.
+    `of_units` has the names of the devices of each hub and unit id.
     """
     stops = f"{either(_WRITES)} in automations and scripts stops, also in other files"
     desk.check(section, f"{stops}: publish to set topics instead, with writes: true in the output")
@@ -42,11 +42,11 @@ def note_write_actions(
     for path, action, data in _writes((), desk.document.data):
         hub, unit = data.get("hub", "modbus_hub"), data.get("slave", data.get("unit", 1))
         address = data.get("address")
-        name = of_units.get((str(hub), _whole(unit)), "")
-        tags = devices[name]["tags"] if name else {}
+        names = of_units.get((str(hub), _whole(unit)), [])
         place = (_WRITES[action], _whole(address))
         instead = "make a tag writable, and publish to its set topic"
-        for key, tag in tags.items():
+        tags = [(name, *item) for name in names for item in devices[name]["tags"].items()]
+        for name, key, tag in tags:
             if (tag["area"], tag["address"]) == place and tag.get("type") != "bit:0":
                 instead = _instead(name, key, tag)
                 break
