@@ -176,6 +176,28 @@ def test_each_value_of_a_structure_is_a_sensor(
     assert f"8: modbus[0].sensors[0]: {message}" in notes(found)
 
 
+def test_a_number_is_written_within_its_limits(imported: Callable[..., Imported]) -> None:
+    found = imported(
+        "numbers: [{name: Setpoint, address: 10, slave: 1, scale: 0.1, offset: 2, min_value: 5, "
+        "max_value: 30, step: 0.5, unit_of_measurement: °C, write_type: holdings}, "
+        "{name: Level, address: 11, slave: 1, data_type: float32, swap: word}]"
+    )
+    place = {"area": "holding_registers", "writable": True}
+    assert tags(found) == {
+        "setpoint": place
+        | {"address": 10, "type": "int16", "scale": 0.1, "offset": 2, "unit": "°C"}
+        | {"min": 5, "max": 30, "round": "nearest", "description": "Setpoint"},
+        "level": place
+        | {"address": 11, "type": "float32", "order": "CDAB", "min": 0, "max": 100}
+        | {"description": "Level"},
+    }
+    device = found.data["devices"]["inverter"]
+    assert device["url"] == "tcp://192.168.1.50:502?write_multiple=1"
+    assert [note for note in notes(found) if "left out" in note] == [
+        "8: modbus[0].numbers[0].step: left out: the step is the scale"
+    ]
+
+
 def test_a_structure_of_several_kinds_is_left_out(imported: Callable[..., Imported]) -> None:
     found = imported(
         "sensors: [{name: x, address: 1, data_type: custom, structure: '>hf', count: 3, scale: 2}, "
@@ -1037,6 +1059,19 @@ def test_a_thermostat_without_a_setpoint_that_it_allows_is_refused(
     with pytest.raises(NotImportable) as raised:
         imported(f"climates: [{{name: x, address: 1, {climate}}}]")
     assert refusals(raised.value) == [f"8: modbus[0].climates[0].{message}"]
+
+
+def test_a_number_is_neither_text_nor_read_only(imported: Callable[..., Imported]) -> None:
+    with pytest.raises(NotImportable) as raised:
+        imported(
+            "numbers: [{name: x, address: 1, data_type: string, count: 2}, "
+            "{name: y, address: 1, input_type: input}, {name: z, address: 1, min_value: 200}]"
+        )
+    assert [line.partition(": found ")[0] for line in refusals(raised.value)] == [
+        "8: modbus[0].numbers[0].data_type",
+        "8: modbus[0].numbers[1].input_type",
+        "8: modbus[0].numbers[2].min_value",
+    ]
 
 
 def test_what_a_line_can_not_have_is_refused(imported: Callable[..., Imported]) -> None:

@@ -189,6 +189,22 @@ def _sensor(places: Places, entity: Section) -> None:
         places.add(name, area, address + index * size, **_given(settings))
 
 
+def _number(places: Places, entity: Section) -> None:
+    """Holding registers with a number that is written, too."""
+    entity.word("input_type", ("holding",))
+    entity.word("data_type", _TYPES)
+    limits = _limits(entity, "min_value", "max_value", (0, 100))
+    is_multiple = entity.word("write_type", ("holding", "holdings")) == "holdings"
+    known = len(places.tags)
+    _sensor(places, entity)
+    for each in places.tags[known:]:
+        each.tag |= {"writable": True, **limits}
+        if each.tag["type"] in INTEGERS:
+            each.tag["round"] = "nearest"
+        if register_count(each.tag["type"]) == 1:
+            places.written[is_multiple].append(entity.path)
+
+
 def _copies(entity: Section) -> int:
     """How many sensors follow the first, each behind the one before it."""
     key = "virtual_count" if entity.get("virtual_count") is not None else "slave_count"
@@ -443,7 +459,7 @@ def _climate(places: Places, entity: Section) -> None:
     address, settings = _address(entity), _typed(entity)
     target = _numbers(entity, "target_temp_register")
     unit = {"F": "°F", "K": "K"}.get(entity.text("temperature_unit") or "C", "°C")
-    limits = _limits(entity)
+    limits = _limits(entity, "min_temp", "max_temp", (5, 35))
     current = _scaled(entity, "current_temp_")
     aim = _scaled(entity, "target_temp_")
     if not target:
@@ -479,15 +495,18 @@ def _climate(places: Places, entity: Section) -> None:
         places.add(title, "holding_registers", register, **written)
 
 
-def _limits(entity: Section) -> dict[str, float]:
-    """The lowest and the highest setpoint."""
-    least, most = entity.number("min_temp"), entity.number("max_temp")
-    limits = {"min": 5 if least is None else least, "max": 35 if most is None else most}
+def _limits(entity: Section, low: str, high: str, usual: tuple[float, float]) -> dict[str, float]:
+    """The least and the greatest value that may be written."""
+    least, most = entity.number(low), entity.number(high)
+    limits = {
+        "min": usual[0] if least is None else least,
+        "max": usual[1] if most is None else most,
+    }
     if limits["min"] > limits["max"]:
         if most is None:
-            entity.problem("min_temp", f"found {least}, allowed: up to max_temp, {limits['max']}")
+            entity.problem(low, f"found {least}, allowed: up to {high}, {limits['max']}")
         else:
-            entity.problem("max_temp", f"found {most}, allowed: at least min_temp, {limits['min']}")
+            entity.problem(high, f"found {most}, allowed: at least {low}, {limits['min']}")
     return limits
 
 
@@ -546,6 +565,7 @@ def _power(places: Places, entity: Section) -> None:
 
 PLATFORMS: dict[str, Entities] = {
     "sensors": _sensor,
+    "numbers": _number,
     "binary_sensors": _binary_sensor,
     "switches": _switch,
     "lights": _switch,

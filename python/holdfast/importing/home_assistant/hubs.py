@@ -51,6 +51,7 @@ _ENTITY_REASONS = {
     "max_value": "values are not limited",
     "min_value": "values are not limited",
     "precision": "values are not rounded; Home Assistant can show fewer digits",
+    "step": "the step is the scale",
     "state_class": "numbers are measurements, and energies totals",
     "temp_step": "the step is the scale",
     "unique_id": "the new entities have ids of their own",
