@@ -300,6 +300,7 @@ def test_switches_write_the_numbers_that_the_source_wrote(
     [
         ("verify: {address: 44}", "holding_registers", 44, {0: "off", 1: "on"}),
         ("verify: {input_type: input}", "input_registers", 7, {0: "off", 1: "on"}),
+        ("verify: {state_on: ['2', 3]}", "holding_registers", 7, {0: "off", 2: "on", 3: "on (3)"}),
         ("verify: {address: 44, input_type: coil}", "coils", 44, None),
         ("verify: {state_on: [1, 3]}", "holding_registers", 7, {0: "off", 1: "on", 3: "on (3)"}),
         (

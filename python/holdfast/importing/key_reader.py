@@ -79,7 +79,7 @@ class Section:
         """The integer at a key."""
         allowed = f"{what} from {least} to {most}"
         value = self._present(key, allowed, required)
-        number = self._number(value)
+        number = self.as_number(value)
         if type(number) is int and least <= number <= most:
             return number
         self._wrong(key, value, allowed)
@@ -88,11 +88,19 @@ class Section:
     def number(self, key: str) -> int | float | None:
         """The number at a key."""
         value = self.get(key)
-        number = self._number(value)
+        number = self.as_number(value)
         if isinstance(number, int | float) and not isinstance(number, bool) and isfinite(number):
             return number
         self._wrong(key, value, "a number")
         return None
+
+    def as_number(self, value: object) -> object:
+        """The number that a text contains, if the source accepted that; else the value."""
+        if isinstance(value, str) and self.desk.quoted_numbers:
+            for kind in (int, float):
+                with suppress(ValueError):
+                    return kind(value)
+        return value
 
     def flag(self, key: str) -> bool | None:
         """The boolean at a key; the source also accepted `yes` and `on`."""
@@ -180,14 +188,6 @@ class Section:
         depth = len(self.path)
         paths = self.desk.report.found.values()
         return any(path[:depth] == self.path and len(path) <= depth + 1 for path in paths)
-
-    def _number(self, value: object) -> object:
-        """The number that a text contains, if the source accepted that; else the value."""
-        if isinstance(value, str) and self.desk.quoted_numbers:
-            for kind in (int, float):
-                with suppress(ValueError):
-                    return kind(value)
-        return value
 
     def _present(self, key: str | int, allowed: str, required: bool) -> Any:
         value = self.get(key)

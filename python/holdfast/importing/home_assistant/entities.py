@@ -396,6 +396,7 @@ def _numbers(entity: Section, key: str) -> list[int]:
     """An integer, or a list of them."""
     given = entity.get(key)
     values = given if isinstance(given, list) else [] if given is None else [given]
+    values = [entity.as_number(value) for value in values]
     if all(type(value) is int and 0 <= value <= 65535 for value in values):
         return values
     entity.problem(key, f"found {show(given)}, allowed: integers from 0 to 65535")
