@@ -1009,6 +1009,19 @@ def test_ports_of_serial_lines(
         assert imported("", hub).data["devices"]["line"]["url"] == url
 
 
+def test_color_temperatures_of_lights_are_left_out_with_the_reason(
+    imported: Callable[..., Imported],
+) -> None:
+    found = imported(
+        "lights: [{name: x, address: 1, color_temp_address: 2, min_temp: 2000, max_temp: 7000}]"
+    )
+    left_out = [note.partition(": left out: ")[2] for note in notes(found) if "left out" in note]
+    assert left_out == [
+        "color temperatures are not converted: add a tag",
+        *["the limits of color temperatures are not converted"] * 2,
+    ]
+
+
 def test_notes_that_are_alike_are_one(imported: Callable[..., Imported]) -> None:
     sensors = ", ".join(f"{{name: s{at}, address: {at}, precision: 1}}" for at in range(9))
     found = [note for note in notes(imported(f"sensors: [{sensors}]")) if "precision" in note]

@@ -46,9 +46,12 @@ _HUB_REASONS = {
 }
 _ENTITY_REASONS = {
     "brightness_address": "brightness is not converted: add a tag",
+    "color_temp_address": "color temperatures are not converted: add a tag",
     "device_class": "it comes from the unit, if that has only one meaning",
     "lazy_error_count": "an entity is unavailable while its device does not answer",
+    "max_temp": "the limits of color temperatures are not converted",
     "max_value": "values are not limited",
+    "min_temp": "the limits of color temperatures are not converted",
     "min_value": "values are not limited",
     "precision": "values are not rounded; Home Assistant can show fewer digits",
     "step": "the step is the scale",
