@@ -1161,6 +1161,16 @@ def test_a_file_without_hubs_is_refused(imported: Callable[..., Imported], text:
         imported("", text)
 
 
+@pytest.mark.parametrize("text", ["default_config:\nautomation: []\n", "- {alias: x}\n"])
+def test_a_file_without_the_section_names_the_file_to_import(
+    imported: Callable[..., Imported], text: str
+) -> None:
+    with pytest.raises(NotImportable) as raised:
+        imported("", text)
+    message = "no section modbus, nor a hub with its type: import the file that has the hubs"
+    assert [(each.line, each.message) for each in raised.value.problems] == [(1, message)]
+
+
 @pytest.mark.parametrize("above", ["default_config:", "# \x85 \u2028 \u2029\r# \r\n#"])
 def test_an_octal_number_is_refused(imported: Callable[..., Imported], above: str) -> None:
     hub = HUB.replace("default_config:", above)

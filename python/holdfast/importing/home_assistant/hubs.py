@@ -95,6 +95,11 @@ def read_home_assistant(path: Path | str) -> Imported:
         elif not source.problems:
             found = "nothing" if hubs is None else show(hubs)
             desk.problem(root, f"found {found}, allowed: the hubs of modbus")
+    has_type = any("type" in hub for _, hub in entries if isinstance(hub, dict))
+    if entries and not roots and not has_type:
+        message = "no section modbus, nor a hub with its type: import the file that has the hubs"
+        desk.problem((), message)
+        entries = []
     found_hubs = [section(desk, path, hub) for path, hub in entries]
     devices = _devices(desk, [hub for hub in found_hubs if hub is not None])
     for entry in former:
