@@ -814,6 +814,51 @@ fn after_broadcast(transport: Transport) -> Client {
 }
 
 #[test]
+fn no_request_begins_while_the_one_before_it_is_still_on_the_line() {
+    // The frames take 8 and 17 characters, of 100 ms each.
+    let character = Duration::from_millis(100);
+    for (transport, carried) in [(RTU, 8 * character), (ASCII, 17 * character)] {
+        for (unit_id, wait) in [(0, TURNAROUND), (7, SECOND)] {
+            let mut client = Client::new(transport);
+            client.connection = Connection::new(transport).on_line(character);
+            let request = EncodedRequest::new(&WRITE);
+            client.connection.send(unit_id, &request, SECOND, client.now).unwrap();
+            assert!(!client.outgoing().is_empty());
+            assert_eq!(client.connection.deadline(), Some(client.now + carried + wait));
+            client.after(carried);
+            assert_eq!(client.got(), []);
+            client.after(wait);
+            assert_eq!(client.got().len(), 1);
+        }
+        // Nor if the connection ends meanwhile.
+        let mut client = Client::new(transport);
+        client.connection = Connection::new(transport).on_line(character);
+        client.send(read());
+        let past = client.connection.take_past(client.now);
+        client.connection = Connection::new(transport);
+        client.connection.follow(past);
+        client.send(WRITE);
+        client.after(carried);
+        assert_eq!(client.outgoing(), []);
+        client.after(SILENCE);
+        assert!(!client.outgoing().is_empty());
+    }
+}
+
+#[test]
+fn a_damaged_reply_on_a_line_that_is_faster_than_its_settings_may_be_followed_by_a_right_one() {
+    let mut client = Client::new(RTU);
+    client.connection = Connection::new(RTU).on_line(SECOND / 10);
+    client.send(read());
+    let mut damaged = rtu_frame(7, &[3, 2, 0, 42]);
+    damaged[6] ^= 1;
+    client.receive(&damaged);
+    assert_eq!(client.got().len(), 1);
+    client.receive(&rtu_frame(7, &[3, 2, 0, 42]));
+    assert_eq!(client.connection.late(), 1);
+}
+
+#[test]
 fn a_confirmation_of_a_broadcast_does_not_end_the_next_write() {
     let other = Request::WriteSingleRegister { address: 3, value: 8 };
     for unit_id in [0, 7] {
@@ -862,10 +907,11 @@ fn the_confirmation_of_a_broadcast_may_come_to_the_next_connection_and_after_a_s
     client.connection = Connection::new(RTU);
     client.connection.follow(past);
     client.connection.send(0, &write, SECOND / 10, client.now).unwrap();
+    client.after(SILENCE);
     client.outgoing();
     client.after(TURNAROUND);
     client.send(WRITE);
-    client.after(SECOND - TURNAROUND - SILENCE);
+    client.after(SECOND - TURNAROUND - 2 * SILENCE);
     assert_eq!(client.outgoing(), []);
     client.after(SILENCE);
     assert_eq!(client.outgoing(), rtu_frame(7, &[6, 0, 3, 0, 7]));

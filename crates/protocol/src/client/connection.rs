@@ -160,7 +160,7 @@ impl Connection {
         }
     }
 
-    /// Sends a request, or queues it until the line is silent. `timeout` runs from when it is sent, and
+    /// Sends a request, or queues it until the line is silent. `timeout` runs from when it has been sent, and
     /// again from each reply to a request that was sent before it. If late replies of the unit repeat, it is
     /// longer, up to four times; end the request with [`Connection::cancel`] if it must not be.
     ///

@@ -233,15 +233,15 @@ impl Flights {
         invalid
     }
 
-    /// Notes that the first request is sent now. Its timeout begins, and may be raised.
-    pub(super) fn transmitted(&mut self, timeout: Duration, now: Time) {
+    /// Notes when the first request has been sent. Its timeout begins then, and may be raised.
+    pub(super) fn transmitted(&mut self, timeout: Duration, sent: Time) {
         let Some(flight) = self.waiting.front_mut() else { return };
         if timeout > flight.timeout {
             self.raised += 1;
             flight.timeout = timeout;
         }
-        flight.sent = now;
-        flight.deadline = now + flight.timeout;
+        flight.sent = sent;
+        flight.deadline = sent + flight.timeout;
     }
 
     /// Notes that all requests are sent now. Their timeouts begin.

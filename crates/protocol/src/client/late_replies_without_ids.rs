@@ -342,7 +342,9 @@ impl LateReplies {
         if earlier.is_unread {
             return Duration::ZERO;
         }
-        let took = now.saturating_sub(earlier.sent).min(earlier.until - earlier.sent);
+        // On a line that is faster than its settings say, it may have ended before it counted as sent.
+        let most = earlier.until.saturating_sub(earlier.sent);
+        let took = now.saturating_sub(earlier.sent).min(most);
         self.lateness.late(earlier.unit_id, took);
         took
     }

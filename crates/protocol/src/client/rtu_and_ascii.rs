@@ -210,17 +210,21 @@ impl OneAtATime {
         {
             flights.out.extend_from_slice(&self.frame);
             let unit_id = flights.first().map_or(0, |flight| flight.unit_id);
-            flights.transmitted(self.late_replies.timeout(unit_id, self.timeout), now);
+            // The driver takes the whole frame at once, and the line carries it then.
+            let sent = now + self.character * self.frame.len() as u32;
+            flights.transmitted(self.late_replies.timeout(unit_id, self.timeout), sent);
+            // Also for the next connection.
+            self.late_replies.used = sent;
             self.late_replies.expire(now);
             self.received.clear();
             let broadcast = flights.first().filter(|flight| flight.unit_id == 0);
             self.state = match broadcast.filter(|_| self.silence.is_some()) {
                 Some(flight) => {
                     // Units may confirm it from now on. No request is sent before the turnaround ends.
-                    let times = (now, self.timeout.max(TURNAROUND));
+                    let times = (sent, self.timeout.max(TURNAROUND));
                     let request = (0, &flight.request);
                     self.late_replies.ended(request, times, Ended::Broadcast, now);
-                    State::Turnaround { until: now + TURNAROUND }
+                    State::Turnaround { until: sent + TURNAROUND }
                 }
                 None => State::Sent { echoed: false },
             };
@@ -422,7 +426,7 @@ impl OneAtATime {
     fn is_too_fast(&mut self, flights: &Flights, pdu_len: usize, now: Time) -> bool {
         let Some(flight) = flights.first() else { return false };
         let took = now.saturating_sub(flight.sent);
-        took < self.needed(pdu_len) && !self.late_replies.is_fast_line()
+        took < self.character * self.reply_len(pdu_len) as u32 && !self.late_replies.is_fast_line()
     }
 
     /// The time that the line needs for the request and its reply.
