@@ -409,7 +409,7 @@ pub(super) fn confirmation(request: &EncodedRequest) -> &[u8] {
 }
 
 /// The number of bytes that a read asks for; `None` for any other request.
-fn read_bytes(request: &EncodedRequest) -> Option<usize> {
+pub(super) fn read_bytes(request: &EncodedRequest) -> Option<usize> {
     match request.request()? {
         Request::ReadCoils(range) | Request::ReadDiscreteInputs(range) => Some(range.byte_len()),
         Request::ReadHoldingRegisters(range) | Request::ReadInputRegisters(range) => {

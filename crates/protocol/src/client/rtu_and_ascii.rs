@@ -10,7 +10,9 @@ use core::time::Duration;
 use super::attempts::Attempt;
 use super::echo::Echo;
 use super::flights::{Call, Done, Flight, Flights, Ticket};
-use super::late_replies_without_ids::{Ended, GUARD, LateReplies, Unanswered, confirmation};
+use super::late_replies_without_ids::{
+    Ended, GUARD, LateReplies, Unanswered, confirmation, read_bytes,
+};
 use super::{Closed, Failure, InvalidResponse, MAX_READ_DELAY, Time};
 use crate::frame::{FrameError, ascii, rtu};
 use crate::pdu::{self, EncodedRequest, ExceptionCode, Response, ResponseError};
@@ -736,7 +738,11 @@ impl OneAtATime {
                     Err(error) if fits => failure = failure.or(Some(error)),
                     Err(error) => self.stray = Some(error),
                 },
-                Ok(_) if fits => return Ok(None),
+                Ok(len) if fits && self.may_come(flights, flight, bytes, len) => {
+                    // If the rest does not come, what was found before it is why there is no reply.
+                    self.stray = failure;
+                    return Ok(None);
+                }
                 Ok(_) => self.stray = Some(FrameError::CheckSum),
                 Err(error) => self.stray = Some(error),
             }
@@ -747,6 +753,26 @@ impl OneAtATime {
             Some(error) if !echo_begun => Err(error),
             _ => Ok(None),
         }
+    }
+
+    /// Whether a reply of this length that has begun like `bytes` may come: to this request, or a late one. One of any
+    /// other length is no beginning of a reply, but noise, or values of a damaged one.
+    fn may_come(
+        &self,
+        flights: &Flights,
+        flight: &Flight,
+        bytes: &[u8],
+        len: Option<usize>,
+    ) -> bool {
+        let (Some(len), Some(code)) = (len, bytes.get(1)) else { return true };
+        let late = self.late_replies.unanswered().map(|earlier| &earlier.request);
+        let mut asked = core::iter::once(&flight.request).chain(late);
+        flights.tolerance.pad
+            || code & 0x80 != 0
+            || asked.any(|request| {
+                let is_of_function = request.pdu().first() == Some(code);
+                is_of_function && read_bytes(request).is_none_or(|count| len == count + 5)
+            })
     }
 
     /// Parses the reply in the received characters; `None` while more are needed.
