@@ -57,7 +57,7 @@ def echo_and_reply(asked: Asked) -> None:
 
 FAULTS: list[tuple[Callable[[Asked], None], str]] = [
     (silent, "no reply within"),
-    (cut_off, "no reply within"),
+    (cut_off, "no complete reply within"),
     (noise, "the checksum is wrong"),
     (damaged, "the checksum is wrong"),
     (two_at_once, "the frame is too short or too long"),

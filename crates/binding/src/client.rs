@@ -560,7 +560,7 @@ pub(crate) fn raised(error: &ClientError) -> PyErr {
             let name = ExceptionCode::from_code(*code).map(ExceptionCode::name);
             ModbusException::new_err((*code, name))
         }
-        ClientError::Timeout(_) => RequestTimeout::new_err(text),
+        ClientError::Timeout(_) | ClientError::Incomplete(_) => RequestTimeout::new_err(text),
         ClientError::NoSilence(_)
         | ClientError::ConnectTimeout { .. }
         | ClientError::LookupTimeout { .. } => RequestTimeout::new_err((text, false)),

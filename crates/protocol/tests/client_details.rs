@@ -234,6 +234,53 @@ fn a_late_reply_may_come_in_pieces_while_no_request_waits() {
     assert_eq!(client.connection.late(), 1);
 }
 
+/// Lets the timeout of a request for four registers end after these bytes of its reply, each within a millisecond.
+fn timed_out_within_its_reply(transport: Transport, received: usize) -> (Client, Vec<u8>) {
+    let reply = frame_of(transport, &[3, 8, 0, 1, 0, 2, 0, 3, 0, 4]);
+    let mut client = Client::new(transport, Tolerance::default());
+    client.connection = Connection::new(transport).on_line(MS);
+    client.send(&read(4));
+    let ends = client.connection.deadline().unwrap();
+    client.receive(&reply[..received]);
+    client.after(ends - client.now);
+    (client, reply)
+}
+
+#[test]
+fn a_reply_that_has_begun_when_the_timeout_ends_has_the_time_that_its_rest_takes() {
+    for transport in [RTU, Transport::SerialAscii { silence: SILENCE }] {
+        let (mut client, reply) = timed_out_within_its_reply(transport, 9);
+        assert_eq!(client.got(), []);
+        let rest = MS * (reply.len() as u32 - 9);
+        assert_eq!(client.connection.deadline(), Some(client.now + rest + GUARD));
+        client.after(rest);
+        client.receive(&reply[9..]);
+        assert_eq!(client.got(), [Ok(vec![3, 8, 0, 1, 0, 2, 0, 3, 0, 4])]);
+        // Not again, if it stops in the middle.
+        let (mut client, _) = timed_out_within_its_reply(transport, 9);
+        client.after(rest + GUARD);
+        assert_eq!(client.got(), [Err(Failure::Incomplete)]);
+        // Not without the start of a reply.
+        let (mut client, _) = timed_out_within_its_reply(transport, 0);
+        assert_eq!(client.got(), [Err(Failure::Timeout)]);
+    }
+}
+
+#[test]
+fn a_late_reply_may_begin_before_the_timeout_and_end_in_pieces_while_another_request_waits() {
+    for transport in [RTU, Transport::SerialAscii { silence: SILENCE }] {
+        let (mut client, reply) = timed_out_within_its_reply(transport, 9);
+        client.after(SECOND);
+        assert_eq!(client.got(), [Err(Failure::Incomplete)]);
+        client.receive(&reply[9..10]);
+        client.send(&coils(0, 1));
+        client.receive(&reply[10..12]);
+        client.receive(&reply[12..]);
+        assert_eq!(client.connection.late(), 1);
+        assert_eq!(client.connection.take_strays(), Strays::default());
+    }
+}
+
 #[test]
 fn the_longest_reply_fits_behind_an_echo() {
     let tolerance = Tolerance { echo: Echo::Always, ..Tolerance::default() };

@@ -44,6 +44,9 @@ pub enum ClientError {
     /// No valid reply arrived within the timeout.
     #[error("no reply within {} s", .0.as_secs_f64())]
     Timeout(Duration),
+    /// Only the start of a reply arrived within the timeout.
+    #[error("no complete reply within {} s, only its start", .0.as_secs_f64())]
+    Incomplete(Duration),
     /// The line was not silent within the timeout. Nothing was sent.
     #[error("nothing was sent within {} s: the line was not silent", .0.as_secs_f64())]
     NoSilence(Duration),
@@ -88,6 +91,7 @@ impl ClientError {
         match failure {
             Failure::Exception(code) => ClientError::Exception(code),
             Failure::Timeout => ClientError::Timeout(timeout),
+            Failure::Incomplete => ClientError::Incomplete(timeout),
             Failure::NoSilence => ClientError::NoSilence(timeout),
             Failure::Invalid(invalid) => ClientError::Invalid(invalid),
             Failure::Closed(why) => ClientError::Lost(Lost::Closed(why)),

@@ -126,6 +126,7 @@ pub(crate) fn fault(error: &ClientError) -> Fault {
     match error {
         ClientError::Exception(code) => Fault::Exception(*code),
         ClientError::Timeout(_)
+        | ClientError::Incomplete(_)
         | ClientError::NoSilence(_)
         | ClientError::ConnectTimeout { .. }
         | ClientError::LookupTimeout { .. } => Fault::Timeout,

@@ -38,9 +38,11 @@ impl Attempt {
             Failure::Exception(_) | Failure::Closed(Closed::BySelf | Closed::NoTransactionId) => {
                 return None;
             }
-            Failure::Timeout | Failure::NoSilence | Failure::Invalid(_) | Failure::Closed(_) => {
-                tolerance.pause
-            }
+            Failure::Timeout
+            | Failure::Incomplete
+            | Failure::NoSilence
+            | Failure::Invalid(_)
+            | Failure::Closed(_) => tolerance.pause,
         };
         (self.retries < tolerance.retries).then(|| Attempt {
             retries: self.retries + 1,

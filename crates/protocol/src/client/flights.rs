@@ -252,6 +252,13 @@ impl Flights {
         }
     }
 
+    /// Gives the first request more time.
+    pub(super) fn prolong(&mut self, by: Duration) {
+        if let Some(flight) = self.waiting.front_mut() {
+            flight.deadline += by;
+        }
+    }
+
     /// Starts the timeout of the first request again.
     pub(super) fn restart(&mut self, now: Time) {
         if let Some(flight) = self.waiting.front_mut() {

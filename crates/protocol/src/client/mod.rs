@@ -101,6 +101,9 @@ pub enum Failure {
     /// No reply arrived within the timeout.
     #[error("no reply in time")]
     Timeout,
+    /// Only the start of a reply arrived within the timeout.
+    #[error("no complete reply in time")]
+    Incomplete,
     /// The request was not sent: within the timeout, the line was not silent.
     #[error("the line was not silent")]
     NoSilence,

@@ -13,7 +13,7 @@ use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::late_replies_without_ids::{
     Ended, GUARD, LateReplies, Unanswered, confirmation, read_bytes,
 };
-use super::{Closed, Failure, InvalidResponse, MAX_READ_DELAY, Time};
+use super::{Closed, Failure, InvalidResponse, MAX_READ_DELAY, Time, Tolerance};
 use crate::frame::{FrameError, ascii, rtu};
 use crate::pdu::{self, EncodedRequest, ExceptionCode, Response, ResponseError};
 
@@ -49,6 +49,8 @@ pub(super) struct OneAtATime {
     timeout: Duration,
     /// The request is not sent before: what it waits for is a pause.
     start: Time,
+    /// Its timeout was prolonged: its reply had begun.
+    is_prolonged: bool,
     /// The request repeats an earlier one of the same call.
     repeats: bool,
     /// A frame came right behind the reply.
@@ -107,6 +109,7 @@ impl OneAtATime {
             too_fast: None,
             timeout: Duration::ZERO,
             start: Time::ZERO,
+            is_prolonged: false,
             repeats: false,
             behind: Behind::NoFrame,
             doubted: None,
@@ -145,8 +148,8 @@ impl OneAtATime {
         };
         let len = len.expect("an encoded request has 1 to 253 bytes, which fit into every frame");
         self.frame.extend_from_slice(&room[..len]);
-        self.received.clear();
-        (self.stray, self.too_fast) = (None, None);
+        self.keep_begun(flights);
+        (self.stray, self.too_fast, self.is_prolonged) = (None, None, false);
         (self.timeout, self.start) = (timeout, start);
         // The reply to the same request, sent before by the same call, is as good.
         self.repeats = attempt != Attempt::default();
@@ -282,6 +285,7 @@ impl OneAtATime {
     ) {
         let is_idle = self.state == State::Idle;
         let may_be_surplus = flights.tolerance.pad && is_idle;
+        let had_begun = self.begun_late(flights);
         if self.received.len() + bytes.len() > self.max_received() {
             self.received.clear();
         }
@@ -291,7 +295,8 @@ impl OneAtATime {
         let echo = if may_be_echo && self.take_echo() { self.frame.len() } else { 0 };
         let late = self.take_late(flights, now);
         if !may_be_surplus {
-            flights.strays.bytes += bytes.len().saturating_sub(echo + late) as u64;
+            let known = echo + late + self.begun_late(flights);
+            flights.strays.bytes += (had_begun + bytes.len()).saturating_sub(known) as u64;
         }
         if late == 0 && is_frame(self.framing, &self.received) {
             self.received.clear();
@@ -368,6 +373,55 @@ impl OneAtATime {
                 ascii::decode(line, &mut body).is_ok_and(is_its).then_some(line.len())
             }
         }
+    }
+
+    /// How much has been received of a reply to this request of a unit that is not complete, and how much is missing.
+    fn begun(
+        &self,
+        pads: bool,
+        request: &EncodedRequest,
+        is_unit: impl Fn(u8) -> bool,
+    ) -> Option<(usize, usize)> {
+        let pdu_len = |bytes: &[u8]| {
+            let is_of_function = |code: &u8| Some(code & 0x7F) == request.pdu().first().copied();
+            let fits = is_unit(*bytes.first()?) && bytes.get(1).is_none_or(is_of_function);
+            let len = response_len(bytes, request).ok().filter(|_| fits)?;
+            let usual = read_bytes(request).map_or(rtu::MAX_LEN, |count| count + 5);
+            self.may_come(pads, request, bytes, len).then(|| len.unwrap_or(usual) - 3)
+        };
+        let missing = |at, pdu_len| {
+            let received = self.received.len() - at;
+            let missing = self.reply_len(pdu_len).saturating_sub(received);
+            (missing > 0).then_some((received, missing))
+        };
+        match self.framing {
+            Framing::Rtu => {
+                (0..self.received.len()).find_map(|at| missing(at, pdu_len(&self.received[at..])?))
+            }
+            Framing::Ascii => {
+                let at = self.received.iter().rposition(|byte| *byte == b':')?;
+                let pairs = self.received[at + 1..].chunks_exact(2);
+                let digits = pairs.map_while(|pair| core::str::from_utf8(pair).ok());
+                let bytes = digits.map_while(|pair| u8::from_str_radix(pair, 16).ok());
+                missing(at, pdu_len(&bytes.collect::<Vec<u8>>())?)
+            }
+        }
+    }
+
+    /// How much has been received of a late reply that is not complete.
+    fn begun_late(&self, flights: &Flights) -> usize {
+        let known = self.late_replies.unanswered().filter(|earlier| !earlier.is_broadcast);
+        let begun = known.filter_map(|earlier| {
+            let is_unit = |unit_id| unit_id == earlier.unit_id;
+            self.begun(flights.tolerance.pad, &earlier.request, is_unit)
+        });
+        begun.map(|(received, _)| received).max().unwrap_or_default()
+    }
+
+    /// Drops what was received, except a late reply that is not complete.
+    fn keep_begun(&mut self, flights: &Flights) {
+        let dropped = self.received.len() - self.begun_late(flights);
+        self.received.drain(..dropped);
     }
 
     /// Handles a reply that can answer the request: believes it, or waits whether another follows.
@@ -683,6 +737,19 @@ impl OneAtATime {
         }
         // First of all: where a thread wakes up late, its request is sent late, and not given up unsent.
         self.transmit(flights, now);
+        let begun = flights.first().filter(|flight| flight.deadline <= now).and_then(|flight| {
+            let Tolerance { pad, accept_unit, .. } = flights.tolerance;
+            let is_unit = |found| accept_unit.accepts(flight.unit_id, found);
+            self.begun(pad, &flight.request, is_unit)
+        });
+        if let Some((_, missing)) = begun
+            && !self.is_prolonged
+            && !self.character.is_zero()
+        {
+            // The line carries nothing else before. An adapter may deliver the last bytes later.
+            self.is_prolonged = true;
+            flights.prolong(self.character * missing as u32 + GUARD);
+        }
         if let Some(flight) = flights.first().filter(|flight| flight.deadline <= now) {
             let how = if flight.may_be_unread(now) { Ended::Unread } else { Ended::TimedOut };
             // Where this is called late, its reply may have come before, and is read only now.
@@ -690,11 +757,13 @@ impl OneAtATime {
         }
         if let Some(flight) = flights.expired(now) {
             let sent = !matches!(self.state, State::Quieting { .. });
-            self.rest(now);
+            (self.state, self.late_replies.used) = (State::Idle, now);
+            self.keep_begun(flights);
             let too_fast = self.too_fast.map(|_| InvalidResponse::TooFast);
             let invalid = too_fast.or(self.stray.map(InvalidResponse::Frame));
             let failure = match invalid {
                 Some(invalid) => Failure::Invalid(invalid),
+                None if begun.is_some() => Failure::Incomplete,
                 // An earlier attempt was sent, and got no reply.
                 None if sent || self.repeats => Failure::Timeout,
                 None => Failure::NoSilence,
@@ -717,6 +786,7 @@ impl OneAtATime {
         if self.awaits_echo(flight) && !*echoed {
             return Ok(None);
         }
+        let pad = flights.tolerance.pad;
         let mut failure = None;
         self.stray = None;
         for start in 0..self.received.len() {
@@ -730,7 +800,7 @@ impl OneAtATime {
                     Ok(reply) => {
                         let behind = bytes.len() - len;
                         self.behind = behind_reply(Framing::Rtu, &bytes[..len], &bytes[len..]);
-                        let stray = if flights.tolerance.pad { start } else { start + behind };
+                        let stray = if pad { start } else { start + behind };
                         let reply = Reply::new(reply, stray);
                         self.received.drain(..start + len);
                         return Ok(Some(reply));
@@ -738,7 +808,7 @@ impl OneAtATime {
                     Err(error) if fits => failure = failure.or(Some(error)),
                     Err(error) => self.stray = Some(error),
                 },
-                Ok(len) if fits && self.may_come(flights, flight, bytes, len) => {
+                Ok(len) if fits && self.may_come(pad, &flight.request, bytes, len) => {
                     // If the rest does not come, what was found before it is why there is no reply.
                     self.stray = failure;
                     return Ok(None);
@@ -759,16 +829,15 @@ impl OneAtATime {
     /// other length is no beginning of a reply, but noise, or values of a damaged one.
     fn may_come(
         &self,
-        flights: &Flights,
-        flight: &Flight,
+        pads: bool,
+        request: &EncodedRequest,
         bytes: &[u8],
         len: Option<usize>,
     ) -> bool {
         let (Some(len), Some(code)) = (len, bytes.get(1)) else { return true };
         let late = self.late_replies.unanswered().map(|earlier| &earlier.request);
-        let mut asked = core::iter::once(&flight.request).chain(late);
-        flights.tolerance.pad
-            || code & 0x80 != 0
+        let mut asked = core::iter::once(request).chain(late);
+        pads || code & 0x80 != 0
             || asked.any(|request| {
                 let is_of_function = request.pdu().first() == Some(code);
                 is_of_function && read_bytes(request).is_none_or(|count| len == count + 5)
