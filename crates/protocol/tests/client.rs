@@ -221,6 +221,18 @@ fn a_line_of_noise_before_the_echo_loses_no_ascii_reply() {
 }
 
 #[test]
+fn lines_without_a_colon_before_an_ascii_reply_are_skipped_and_counted() {
+    for stray in [&b"\r\n"[..], b"x\r\n", b"3F\r\n\r\n"] {
+        let mut client = Client::new(ASCII);
+        let ticket = client.send(read());
+        client.receive(&[stray, &ascii_frame(7, &[3, 2, 0, 42])].concat());
+        assert_eq!(client.got(), [(ticket, Ok(vec![0, 42]))], "{stray:?}");
+        let bytes = stray.len() as u64;
+        assert_eq!(client.connection.take_strays(), Strays { replies: 0, bytes });
+    }
+}
+
+#[test]
 fn the_wait_for_a_second_reply_does_not_count_as_response_time() {
     let mut client = Client::new(Transport::RtuOverTcp);
     let ms = SECOND / 1000;

@@ -852,7 +852,10 @@ impl OneAtATime {
     ) -> Result<Option<Reply>, FrameError> {
         while let Some(end) = self.received.windows(2).position(|pair| pair == b"\r\n") {
             let line: Vec<u8> = self.received.drain(..end + 2).collect();
-            let start = line.iter().rposition(|byte| *byte == b':').unwrap_or(0);
+            let Some(start) = line.iter().rposition(|byte| *byte == b':') else {
+                flights.strays.bytes += line.len() as u64;
+                continue;
+            };
             let behind = if flights.tolerance.pad { 0 } else { self.received.len() };
             let line = &line[start..];
             let Some(flight) = flights.first() else { return Ok(None) };
