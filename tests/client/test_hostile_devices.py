@@ -663,7 +663,8 @@ def test_a_reply_that_does_not_come_times_out(
         client = connected(dial, device.url, timeout)
         began = time.monotonic()
 
-        with pytest.raises(holdfast.RequestTimeout, match=f"^no reply within {timeout} s$"):
+        text = f"^no (complete )?reply within {timeout} s(, only its start)?$"
+        with pytest.raises(holdfast.RequestTimeout, match=text):
             client.write_register(7, 70)
 
         assert timeout <= time.monotonic() - began < wire.DEADLINE
