@@ -241,6 +241,19 @@ def test_noise_between_rtu_frames_is_passed_over(noise: bytes, plant: Plant) -> 
     assert plant.serves()
 
 
+@only_rtu
+@pytest.mark.parametrize("unit", [0, UNIT], ids=["broadcast", "own"])
+@pytest.mark.parametrize("noise", [b"\x00", b"\x00\x00", b"\xff"])
+def test_noise_right_behind_a_request_makes_it_a_damaged_frame(
+    noise: bytes, unit: int, plant: Plant
+) -> None:
+    plant.line.send(lines.rtu(WRITE, unit) + noise)
+    plant.await_frames("damaged", 1)
+
+    assert plant.serves()
+    assert not any(content(plant.memory)["holding_registers"])
+
+
 @only_ascii
 @pytest.mark.parametrize("noise", [b"\x00", b"\r\n", b"0703", b"\xff" * 3, bytes(range(58)) * 20])
 def test_noise_between_ascii_frames_is_passed_over(noise: bytes, plant: Plant) -> None:

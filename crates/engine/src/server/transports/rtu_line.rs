@@ -136,6 +136,14 @@ impl RtuLine {
     }
 }
 
+/// Whether more follows a request whose length is known. The CRC fits again behind zeros, which are noise then, and
+/// no longer request.
+pub(super) fn has_more(frame: &[u8]) -> bool {
+    let mut requests = Requests::default();
+    let found = requests.next(frame);
+    matches!(found, Next::Frame { len, .. } if len < frame.len()) && requests.is_at_start()
+}
+
 async fn read(port: &SerialPort) -> io::Result<([u8; MAX_BYTES], usize)> {
     let mut bytes = [0; MAX_BYTES];
     match port.read(&mut bytes).await? {
@@ -217,6 +225,23 @@ mod tests {
         line.append(&[9, 3, 2]);
         assert!(line.waits_for_rest(true, |_| false));
         assert!(!line.waits_for_rest(true, |_| false), "only once without new bytes");
+    }
+
+    #[test]
+    fn zeros_behind_a_request_are_no_part_of_it() {
+        let read = frame(&[3, 0, 0, 0, 1]);
+        for (bytes, expected) in [
+            (read.clone(), false),
+            ([&read[..], &[0]].concat(), true),
+            ([&read[..], &[0, 0]].concat(), true),
+            // A longer request.
+            (frame(&[3, 0, 0, 0, 1, 0]), false),
+            // Of an unknown length: the CRC fits before its last byte too.
+            ([&frame(&[100])[..], &[0]].concat(), false),
+        ] {
+            assert!(rtu::decode(&bytes).is_ok());
+            assert_eq!(has_more(&bytes), expected, "{bytes:?}");
+        }
     }
 
     #[test]

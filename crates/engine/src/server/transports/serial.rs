@@ -32,7 +32,7 @@ use crate::server::rights::peer_rights::PeerRights;
 use crate::server::rights::rule::Rule;
 use crate::server::transports::framing::{Framing, Rtu};
 use crate::server::transports::line_echo::LineEcho;
-use crate::server::transports::rtu_line::RtuLine;
+use crate::server::transports::rtu_line::{RtuLine, has_more};
 
 /// The unit id that addresses all units (Modbus over Serial Line V1.02, 2.2).
 const BROADCAST: u8 = 0;
@@ -189,7 +189,7 @@ impl ModbusSerial {
         line: &mut RtuLine,
         echo: &mut LineEcho,
     ) -> io::Result<()> {
-        let Ok((unit_id, request)) = rtu::decode(frame) else {
+        let (false, Ok((unit_id, request))) = (has_more(frame), rtu::decode(frame)) else {
             self.damaged();
             return Ok(());
         };
