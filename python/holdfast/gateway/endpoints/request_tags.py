@@ -80,7 +80,8 @@ async def tags_of(given: Given, profiles: Mapping[str, TagList]) -> TagList:
         # Parsing a long list takes a second, in which other requests are answered.
         parser = _LONG if len(text) > SHORT_SIZE else _SHORT
         key = text, given["format"] == "csv"
-        return _KNOWN.get(key) or await parser.call(partial(_parsed, *key))
+        tags = _KNOWN.get(key)
+        return await parser.call(partial(_parsed, *key)) if tags is None else tags
     if profile not in profiles:
         known = listing(profiles) or "none, the configuration has no profiles"
         hint = suggestion(profile, profiles)
