@@ -51,6 +51,7 @@ __all__ = [
     "MAX_PDU",
     "READ_RECORDS",
     "RETRY_PAUSES_S",
+    "RETRY_REFUSED_AFTER_S",
     "SUB_FUNCTIONS",
     "TLS_REASONS",
     "UNMEASURED_COST_MS",
@@ -81,11 +82,11 @@ __all__ = [
     "OutOfRange",
     "ParsedWrites",
     "Passage",
+    "PollReceiver",
     "PolledDevice",
     "Poller",
     "RawRule",
     "Request",
-    "Results",
     "Route",
     "Rule",
     "ServerTls",
@@ -146,6 +147,9 @@ MAX_LATENESS_S: Final[float]
 
 RETRY_PAUSES_S: Final[tuple[float, float]]
 """The first and the longest pause after failures, where a device has no others."""
+
+RETRY_REFUSED_AFTER_S: Final[float]
+"""Seconds after which what a device refuses to read is tried again."""
 
 UNMEASURED_COST_MS: Final[tuple[float, float]]
 """The costs of a request and of a register until a device with `max_gap: auto` is measured."""
@@ -505,7 +509,7 @@ class Batch:
         """
 
     def check(self) -> None:
-        """Checks what can be known before the write. Raises `BatchRefused`."""
+        """Checks what can be known before the memories are locked. Raises `BatchRefused`."""
 
     def lines(
         self, origin: bytes, names: Sequence[bytes], outcome: str, sequence: int | None = None
@@ -516,8 +520,11 @@ class Batch:
         """
 
     @property
-    def is_refusable(self) -> bool:
-        """Whether `write` can still refuse: by a journal, or because a memory is not sealed."""
+    def can_be_refused(self) -> bool:
+        """Whether `write` can still raise `BatchRefused` after `check`.
+
+        A journal may refuse, a memory may not be sealed, or values may be stale.
+        """
 
     def write(self) -> tuple[int, int | None]:
         """Writes all values in one step.
@@ -527,9 +534,10 @@ class Batch:
         """
 
     def submit(self, ended: Callable[[tuple[int, int | None] | BatchRefused], object]) -> None:
-        """As `write`, by the journal of the memories and without waiting for it.
+        """As `write`, but returns at once.
 
-        Calls `ended` in another thread, with the result or the error.
+        The journal of the memories carries out the write, and calls `ended` in another thread, with
+        the result or the error.
         """
 
 @final
@@ -1320,7 +1328,7 @@ class PolledDevice:
     request, of a register or 16 bits) selects the gaps that are read; `readable` and `forbidden`
     are areas with start and end, exclusive. `status` is the memory of the status block, and the
     block. `start_within` is the maximum delay of the first poll (default: the interval, at most 10
-    s). `report` takes the polls; `fields` are areas, addresses and counts that are read only for
+    s). `receiver` takes the polls; `fields` are areas, addresses and counts that are read only for
     it, and not forwarded. `release` closes the connection after each poll. With `measured`,
     measurements replace `cost` after a while. `retry` are the first and the longest pause after
     failures (default: `RETRY_PAUSES_S`). With `jitter`, they are up to a quarter shorter, and the
@@ -1349,7 +1357,7 @@ class PolledDevice:
         status: tuple[Memory, StatusBlock] | None = None,
         start_within: float | None = None,
         in_flight: int | None = 1,
-        report: Results | None = None,
+        receiver: PollReceiver | None = None,
         fields: Sequence[tuple[Area, int, int]] | None = None,
         release: bool = False,
         measured: bool = False,
@@ -1360,7 +1368,9 @@ class PolledDevice:
 
 @final
 class Fence:
-    """Until when devices may be used; it begins closed. Times are those of `time.monotonic`.
+    """Stops the use of devices when a lease ends. Times are those of `time.monotonic`.
+
+    It begins closed.
 
     It is compared with the clock at the last moment before something is sent, so a process that was
     stopped sends nothing when it goes on too late.
@@ -1379,9 +1389,14 @@ class Fence:
         """Moves the end, never to an earlier time. Without effect if it was closed."""
 
     def end(self) -> None:
-        """Lets running polls finish, and no new ones begin. Go on to renew it meanwhile."""
+        """Lets running polls finish, and no new ones begin.
 
-    def close(self) -> None: ...
+        Renew it until `in_use` is 0, then close it.
+        """
+
+    def close(self) -> None:
+        """Sends nothing more, and closes the connections to the devices."""
+
     @property
     def is_open(self) -> bool:
         """Whether polls and writes may begin."""
@@ -1506,7 +1521,7 @@ class Withdrawal:
         """What still waits for its turn is not sent any more: clients get exception 0A."""
 
 @final
-class Results:
+class PollReceiver:
     """A receiver of polls, and of the results of writes. Its queue is bounded."""
 
     def take(
@@ -1563,13 +1578,13 @@ class Poller:
         """
 
     def write(
-        self, name: str, request: Request, to: Results, *, within: float | None = None
+        self, name: str, request: Request, receiver: PollReceiver, *, within: float | None = None
     ) -> int:
         """Sends a write to a device over its own connection, between two reads.
 
-        Returns the number under which `to` has the result. What can't be sent `within` seconds,
-        and one timeout of the device, or waits through a standstill, is not sent any more: its
-        fault is `expired`. Raises `ValueError` for an unknown device or a request that does not
+        Returns the number under which `receiver` has the result. What can't be sent `within`
+        seconds, and one timeout of the device, or waits through a standstill, is not sent any more:
+        its fault is `expired`. Raises `ValueError` for an unknown device or a request that does not
         write, `RuntimeError` after `stop`.
         """
 
@@ -1594,10 +1609,11 @@ class Poller:
         Raises `ValueError`, and `RuntimeError` after `stop`.
         """
 
-    def known_link(self, endpoint: Endpoint) -> Link | None:
+    def link_if_used(self, endpoint: Endpoint) -> Link | None:
         """The link to an address that a device or another link uses, with the same certificates.
 
-        Returns `None` if none does. Raises `RuntimeError` after `stop`.
+        If only devices use it, creates the link, with default settings. Returns `None` if none
+        does. Raises `RuntimeError` after `stop`.
         """
 
     def forget_links(self, used: Sequence[Link]) -> None:
@@ -1622,13 +1638,13 @@ class Poller:
     def remove(self, name: str) -> bool:
         """Removes a device. Returns whether it existed."""
 
-    def receiver(self) -> Results:
+    def new_receiver(self) -> PollReceiver:
         """A new receiver of polls and of the results of writes. It ends with the poller."""
 
-    def counters(self, *, of: Results | None = None) -> dict[str, dict[str, Any]]:
+    def counters(self, *, receiver: PollReceiver | None = None) -> dict[str, dict[str, Any]]:
         """The health and counters of each device and of its forwards, by device name.
 
-        `of` selects the devices whose polls this receiver takes; `None` selects all.
+        `receiver` selects the devices whose polls it takes; `None` selects all.
 
         `error` is the text of `last_error`, `None` if no request has failed so. `age` is the age of
         the last valid reply, `None` before the first. `plan_error` is the reason why the device has

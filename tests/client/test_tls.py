@@ -138,9 +138,9 @@ def _polled(url: str, timeout: float) -> Sequence[int]:
     reads: Any = [("holding_registers", 0, 3, None)]
     options: dict[str, Any] = {"interval": 60, "timeout": timeout, "start_within": 0}
     poller = _core.Poller([])
-    results = poller.receiver()
+    results = poller.new_receiver()
     device = _core.PolledDevice(
-        "plc", endpoint(parse(url)), unit=1, reads=reads, report=results, **options
+        "plc", endpoint(parse(url)), unit=1, reads=reads, receiver=results, **options
     )
     try:
         poller.add(device)

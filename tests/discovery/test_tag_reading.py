@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
-from holdfast.client.tag_reading import REFUSAL_RETRY_S, TagReader
+from holdfast._core import RETRY_REFUSED_AFTER_S
+from holdfast.client.tag_reading import TagReader
 from holdfast.errors import ConnectFailed, ModbusException, RequestTimeout
 from holdfast.tags import Tag, TagList
 from holdfast.tags.scale import RegisterScale
@@ -112,9 +113,9 @@ def test_a_refused_tag_is_tried_again_after_a_minute() -> None:
         reader = TagReader([tag("a", 0), tag("b", 1)], clock=lambda: moment)
         assert isinstance(read(device, reader)[1], ModbusException)
         absent.clear()
-        moment = REFUSAL_RETRY_S - 1
+        moment = RETRY_REFUSED_AFTER_S - 1
         assert isinstance(read(device, reader)[1], ModbusException)
-        moment = REFUSAL_RETRY_S
+        moment = RETRY_REFUSED_AFTER_S
         assert read(device, reader) == [7, 7]
         assert asked(device)[-1] == (0, 2)
 

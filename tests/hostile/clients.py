@@ -222,7 +222,7 @@ class Polled(Asking):
         self.memory = holdfast.Memory(holding_registers=64, input_registers=64)
         self.poller = Poller([])
         self.stack.callback(self.poller.stop)
-        self.results = self.poller.receiver()
+        self.results = self.poller.new_receiver()
         self.pending: dict[int, tuple[int, int, int]] = {}
         self.last = dict.fromkeys(UNITS, 0)
         """The number of the last request of each device that had a valid reply."""
@@ -244,7 +244,7 @@ class Polled(Asking):
             timeout=self.timeout,
             reads=reads,
             start_within=0.0,
-            report=self.results,
+            receiver=self.results,
             retry=(RETRY["first"], RETRY["most"]),
         )
 

@@ -213,10 +213,10 @@ def test_a_write_can_require_that_all_memories_of_the_batch_are_sealed() -> None
     sealed, other = (Memory(coils=8, holding_registers=8, seal=("coils", 0)) for _ in range(2))
     only: Any = (sealed, "holding_registers", 0, [7], True)
     both = Batch([only, (other, "holding_registers", 0, [8])])
-    assert both.is_refusable
+    assert both.can_be_refused
     assert both.write() == (2, None)
     one = Batch([(other, "coils", 0, [1])])
-    assert not one.is_refusable
+    assert not one.can_be_refused
     assert one.write() == (1, None)
     assert refusal([only, (other, "holding_registers", 0, [9])]) == (1, None, "unsealed")
     assert refusal([(other, "coils", 0, [1], True)]) == (0, None, "unsealed")

@@ -109,7 +109,7 @@ def test_a_poll_that_has_begun_ends_before_a_lease_is_given_back(poller: Reporti
         reads = [("holding_registers", 0, 1, None), ("holding_registers", 500, 1, None)]
         settings: dict[str, Any] = {"unit": 1, "interval": 0.0, "timeout": 10.0, "reads": reads}
         poller._poller.add(
-            PolledDevice("a", endpoint, fence=fence, report=poller.results, **settings)
+            PolledDevice("a", endpoint, fence=fence, receiver=poller.results, **settings)
         )
         wire.until(lambda: len(waiting) == 1, "the first block is asked for")
         fence.end()
@@ -209,7 +209,7 @@ def test_other_transports_obey_too(poller: ReportingPoller, kind: str) -> None:
         reads = [("holding_registers", 0, 1, None)]
         settings: dict[str, Any] = {"unit": 1, "interval": 0.01, "timeout": 10.0, "reads": reads}
         poller._poller.add(
-            PolledDevice("a", endpoint, fence=fence, report=poller.results, **settings)
+            PolledDevice("a", endpoint, fence=fence, receiver=poller.results, **settings)
         )
         write = Request.write_register(3, 7)
         assert written(poller, poller.write("a", write)) == STANDBY

@@ -161,14 +161,14 @@ def test_a_forgotten_link_is_closed_before_the_next_one_is_opened(
 def test_the_end_of_a_poller_ends_the_wait_for_results() -> None:
     poller = Poller([])
     found: list[Any] = []
-    results = poller.receiver()
+    results = poller.new_receiver()
     waiting = threading.Thread(target=lambda: found.append(results.take(3600)))
     waiting.start()
     poller.stop()
     waiting.join()
     assert found == [None]
     assert results.take(3600) is None
-    assert poller.receiver().take(3600) is None
+    assert poller.new_receiver().take(3600) is None
 
 
 def test_a_device_takes_the_place_of_another_with_its_connection_and_counters(

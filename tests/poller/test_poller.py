@@ -1130,8 +1130,8 @@ class Altered:
         self._poller = poller
         self.counters_instead: dict[str, Any] = {}
 
-    def counters(self, *, of: Any = None) -> dict[str, dict[str, Any]]:
-        told: dict[str, dict[str, Any]] = self._poller.counters(of=of)
+    def counters(self, *, receiver: Any = None) -> dict[str, dict[str, Any]]:
+        told: dict[str, dict[str, Any]] = self._poller.counters(receiver=receiver)
         return {name: {**counted, **self.counters_instead} for name, counted in told.items()}
 
     def __getattr__(self, name: str) -> Any:

@@ -156,7 +156,7 @@ def test_only_the_polls_of_a_former_address_are_discarded() -> None:
     async def run() -> list[tuple[str, bool]]:
         changes: list[tuple[str, bool]] = []
         core = SimpleNamespace(
-            receiver=lambda: Results([]),
+            new_receiver=lambda: Results([]),
             remove=lambda _: None,
             add=lambda name: changes.append((name, False)),
             replace=lambda old, name, **_: changes.append((name, old == name)),

@@ -27,13 +27,13 @@ class ReportingPoller:
 
     def __init__(self) -> None:
         self._poller = Poller([])
-        self.results = self._poller.receiver()
+        self.results = self._poller.new_receiver()
 
     def add(self, device: Made) -> None:
-        self._poller.add(device(report=self.results))
+        self._poller.add(device(receiver=self.results))
 
     def replace(self, name: str, device: Made, *, at_once: bool = True) -> None:
-        self._poller.replace(name, device(report=self.results), at_once=at_once)
+        self._poller.replace(name, device(receiver=self.results), at_once=at_once)
 
     def write(self, name: str, request: Request, *, within: float | None = None) -> int:
         return self._poller.write(name, request, self.results, within=within)

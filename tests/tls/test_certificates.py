@@ -90,9 +90,9 @@ def polled(url: str) -> str:
     reads: Any = [("holding_registers", 0, 1, None)]
     options: dict[str, Any] = {"interval": 60, "timeout": wire.DEADLINE, "start_within": 0}
     poller = _core.Poller([])
-    results = poller.receiver()
+    results = poller.new_receiver()
     device = _core.PolledDevice(
-        "plc", endpoint(parse(url)), unit=1, reads=reads, report=results, **options
+        "plc", endpoint(parse(url)), unit=1, reads=reads, receiver=results, **options
     )
     try:
         poller.add(device)

@@ -268,7 +268,7 @@ def test_a_listener_takes_no_certificates_of_https(plant: Plant) -> None:
     own = plant.files()
     del own["ca_file"]
     tls = _core.https_server_tls(**own)
-    with pytest.raises(ValueError, match="tls is that of an HTTPS server, allowed: ServerTls"):
+    with pytest.raises(ValueError, match="tls is for an HTTPS server; use ServerTls"):
         _core.Listener("secure", "127.0.0.1:0", [], {**STREAM_DEFAULTS, "tls": tls})
 
 

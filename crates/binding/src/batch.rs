@@ -66,14 +66,11 @@ impl Batch {
         Ok(Batch { writes: writes.collect(), bytes, access })
     }
 
-    /// Checks what can be known before the memories are locked.
     fn check(&self, py: Python<'_>) -> PyResult<()> {
         let checked = holdfast_memory::check_across(self.access, &self.packed());
         checked.map_err(|error| refused(py, error))
     }
 
-    /// The lines of the audit log for its writes, without time and place in the chain. Each begins
-    /// with `origin`; `names` are the names of the memories in JSON.
     #[pyo3(signature = (origin, names, outcome, sequence=None))]
     fn lines<'py>(
         &self,
@@ -88,23 +85,18 @@ impl Batch {
         lines.iter().map(|line| PyBytes::new(py, line)).collect()
     }
 
-    /// Whether `write` can still refuse: by a journal, or because a memory is not sealed, or values are stale.
     #[getter]
-    fn is_refusable(&self) -> bool {
+    fn can_be_refused(&self) -> bool {
         let can_refuse = |&Checked { ref memory, area, address, count }: &Checked| {
             memory.get().core.can_refuse_checked(area, address, count)
         };
         self.access == Access::Restore || self.writes.iter().any(can_refuse)
     }
 
-    /// Writes all values atomically. Returns their number, and the sequence of the step if a log has
-    /// carried it out.
     fn write(&self, py: Python<'_>) -> PyResult<(usize, Option<u64>)> {
         self.carry_out(py).map_err(|error| refused(py, error))
     }
 
-    /// As `write`, by the journal of the memories and without waiting for it. `ended` is called in
-    /// another thread, with the result or the `BatchRefused`.
     fn submit(&self, py: Python<'_>, ended: Py<PyAny>) {
         let (mut waiting, packed) = (Waiting::new(ended, self.count()), self.packed());
         let done = Box::new(move |outcome| waiting.end(outcome));
@@ -161,23 +153,23 @@ impl Batch {
 impl<'py> Pending<'py> {
     fn new(command: usize, write: &Bound<'py, PyAny>) -> PyResult<Pending<'py>> {
         let ((memory, area, address), values, restores) = parts(write)?;
-        let refused = |reason| Err(refusal(write.py(), command, None, reason));
-        let Some(area) = Area::from_name(area.to_str()?) else { return refused("invalid_area") };
+        let refuse = |reason| Err(refusal(write.py(), command, None, reason));
+        let Some(area) = Area::from_name(area.to_str()?) else { return refuse("invalid_area") };
         let values = match values.cast_into_exact::<PyList>() {
             Ok(list) => list,
             Err(error) => match listed(&error.into_inner())? {
                 Some(list) => list,
-                None => return refused("invalid_type"),
+                None => return refuse("invalid_type"),
             },
         };
         let count = values.len();
         if count == 0 {
-            return refused("empty");
+            return refuse("empty");
         }
         let span = memory.get().core.span(area);
         let address = u16::try_from(integer(&address)?).ok();
         let Some(address) = address.filter(|address| span.holds(*address, count)) else {
-            return refused("out_of_range");
+            return refuse("out_of_range");
         };
         Ok(Pending { memory, area, address, count, values, restores })
     }

@@ -360,7 +360,7 @@ impl BlockingClient {
             // Without an answer, nothing is sent.
             Python::attach(|py| is_cancelled.call0(py)?.is_truthy(py)).unwrap_or(true)
         };
-        let to_begin = |_| {
+        let may_send = |_| {
             let cancelled = || ClientError::Lost(Lost::Closed(Closed::BySelf));
             if is_cancelled() { Err(cancelled()) } else { Ok(()) }
         };
@@ -368,13 +368,13 @@ impl BlockingClient {
         let is_over = || !was_sent.load(Ordering::Relaxed) && is_cancelled();
         let result = self.interruptible(py, is_over, |interrupted| {
             let called = (unit, request);
-            self.core.interruptible_call(interrupted, &to_begin, &was_sent, called, timeout, take)
+            self.core.interruptible_call(interrupted, &may_send, &was_sent, called, timeout, take)
         })?;
         let closed = || Err(ClientError::Lost(Lost::Closed(Closed::BySelf)));
         let pdu = result
             .unwrap_or_else(closed)
             .map_err(|error| of_request(py, &error, was_sent.load(Ordering::Relaxed)))?;
-        value(py, response(request, &pdu).map_err(|error| raised(&error))?)
+        value(py, response(request, &pdu).map_err(|error| to_py_err(&error))?)
     }
 
     /// Ends the call that waits for its reply, and its connection.
@@ -549,11 +549,11 @@ fn words<'py>(py: Python<'py>, registers: &[u8]) -> PyResult<Bound<'py, PyAny>> 
 
 /// The Python exception of an error, as an object.
 pub(crate) fn exception<'py>(py: Python<'py>, error: &ClientError) -> Bound<'py, PyAny> {
-    raised(error).into_value(py).into_bound(py).into_any()
+    to_py_err(error).into_value(py).into_bound(py).into_any()
 }
 
 /// Maps an error to its Python exception.
-pub(crate) fn raised(error: &ClientError) -> PyErr {
+pub(crate) fn to_py_err(error: &ClientError) -> PyErr {
     let text = error.to_string();
     match error {
         ClientError::Exception(code) => {
@@ -578,9 +578,9 @@ pub(crate) fn raised(error: &ClientError) -> PyErr {
     }
 }
 
-/// As `raised`, for the error of a request. Errors of TLS say themselves whether it may have been sent.
+/// As `to_py_err`, for the error of a request. Errors of TLS say themselves whether it may have been sent.
 pub(crate) fn of_request(py: Python<'_>, error: &ClientError, maybe_sent: bool) -> PyErr {
-    let raised = raised(error);
+    let raised = to_py_err(error);
     if maybe_sent || !matches!(error, ClientError::Lost(_)) {
         return raised;
     }

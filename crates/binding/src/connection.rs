@@ -19,7 +19,7 @@ use pyo3::{PyTraverseError, PyVisit, intern};
 
 use crate::arguments::{byte, seconds};
 use crate::channel::Tls;
-use crate::client::{Endpoint, Request, exception, of_request, raised, show, value};
+use crate::client::{Endpoint, Request, exception, of_request, show, to_py_err, value};
 use crate::memory::Integer;
 
 /// No call into Python is made while its state is locked, but for those that make objects: the callee could
@@ -107,7 +107,7 @@ impl Connection {
         let tls = match tls {
             None => None,
             Some(tls) => Some(Tls::new(tls).map_err(|failure| {
-                raised(&ClientError::Tls { to: to.clone(), failure, maybe_sent: false })
+                to_py_err(&ClientError::Tls { to: to.clone(), failure, maybe_sent: false })
             })?),
         };
         let time = event_loop.getattr("time")?;

@@ -2,7 +2,7 @@
 //! and faults, and defaults.
 
 use holdfast_engine::link::{Fault, InFlight, LinkSettings};
-use holdfast_engine::poller::UNMEASURED_COST_MS;
+use holdfast_engine::poller::{RETRY_REFUSED_AFTER, UNMEASURED_COST_MS};
 use holdfast_engine::tls::TlsFailure;
 use holdfast_journal::log::{CONTACTS_PER_LAG, MAX_LAG, WRITE_TIMEOUT};
 use holdfast_memory::{Area, Span};
@@ -39,6 +39,7 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     let Retry { first, most, .. } = Retry::default();
     module.add("RETRY_PAUSES_S", (first.as_secs_f64(), most.as_secs_f64()))?;
     module.add("UNMEASURED_COST_MS", UNMEASURED_COST_MS)?;
+    module.add("RETRY_REFUSED_AFTER_S", RETRY_REFUSED_AFTER.as_secs_f64())?;
     module.add("MAX_IN_FLIGHT", InFlight::MAX)?;
     module.add("LINK_QUEUE", LinkSettings::QUEUE)?;
     module.add("MAX_LINK_QUEUE", LinkSettings::MAX_QUEUE)?;

@@ -72,7 +72,7 @@ impl Engine {
         let all = listeners.iter().flat_map(|(listener, sessions)| {
             sessions.iter().map(move |session| (listener, session))
         });
-        all.map(|(listener, session)| shown(py, listener, session)).collect()
+        all.map(|(listener, session)| session_to_python(py, listener, session)).collect()
     }
 
     fn end_session(&self, py: Python<'_>, listener: &str, id: u64) -> bool {
@@ -80,7 +80,7 @@ impl Engine {
     }
 
     fn heartbeats(&self) -> Vec<(String, f64, Option<u32>)> {
-        self.core.heartbeats().iter().map(|beats| heartbeat::shown(beats)).collect()
+        self.core.heartbeats().iter().map(|beats| heartbeat::to_python(beats)).collect()
     }
 
     #[getter]
@@ -98,7 +98,7 @@ impl Engine {
     fn counters<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
         for listener in self.core.counters() {
-            all.set_item(listener.name(), counted(py, &listener)?)?;
+            all.set_item(listener.name(), counters_to_python(py, &listener)?)?;
         }
         Ok(all)
     }
@@ -174,7 +174,7 @@ fn verbosity(events: &str) -> PyResult<Verbosity> {
     word("events", events, &verbosities)
 }
 
-fn shown<'py>(
+fn session_to_python<'py>(
     py: Python<'py>,
     listener: &str,
     session: &OpenConnection,
@@ -189,7 +189,7 @@ fn shown<'py>(
     Ok(all)
 }
 
-fn counted_packets<'py>(
+fn packet_counters_to_python<'py>(
     py: Python<'py>,
     counters: &PacketCounters,
 ) -> PyResult<Bound<'py, PyDict>> {
@@ -199,7 +199,10 @@ fn counted_packets<'py>(
     Ok(packets)
 }
 
-fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<'py, PyDict>> {
+fn counters_to_python<'py>(
+    py: Python<'py>,
+    listener: &ListenerCounters,
+) -> PyResult<Bound<'py, PyDict>> {
     let all = PyDict::new(py);
     match &listener.protocol {
         ProtocolCounters::Modbus(unit_server, packets) => {
@@ -209,11 +212,11 @@ fn counted<'py>(py: Python<'py>, listener: &ListenerCounters) -> PyResult<Bound<
             all.set_item("unanswered", counters.unanswered.get())?;
             all.set_item("frames", counters.frames.by_name().into_py_dict(py)?)?;
             if let Some(packets) = packets {
-                all.set_item("packets", counted_packets(py, packets)?)?;
+                all.set_item("packets", packet_counters_to_python(py, packets)?)?;
             }
         }
         ProtocolCounters::Packets(packets) => {
-            all.set_item("packets", counted_packets(py, packets)?)?;
+            all.set_item("packets", packet_counters_to_python(py, packets)?)?;
         }
     }
     let counters = listener.connections();

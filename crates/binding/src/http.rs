@@ -209,7 +209,7 @@ impl HttpServer {
 
     /// The name of the thread, seconds since its last beat, and the system's number of it.
     fn heartbeat(&self) -> (String, f64, Option<u32>) {
-        heartbeat::shown(self.core.heartbeat())
+        heartbeat::to_python(self.core.heartbeat())
     }
 
     fn set_tls(&self, tls: PyRef<'_, ServerTls>) -> PyResult<()> {

@@ -1,4 +1,4 @@
-//! `Fence`: until when devices may be used.
+//! `Fence`: stops the use of devices when the lease of this node ends.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};

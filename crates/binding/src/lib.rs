@@ -1,7 +1,8 @@
 //! `holdfast._core`: the Python interface of the native crates.
 //!
-//! This crate converts and forwards. It contains no logic. It releases the interpreter around every
-//! call that can block.
+//! This crate converts and forwards. Its only logic saves calls of the interpreter for REST writes
+//! (`json_commands`, `request_heads`, `HttpServer::take`). It releases the interpreter around every call that can
+//! block.
 
 mod arguments;
 mod audit_fields;
@@ -77,7 +78,7 @@ mod _core {
     #[pymodule_export]
     use super::mirror_age::MirrorAge;
     #[pymodule_export]
-    use super::poller::{PolledDevice, Poller, Results, plan_blocks, write_disabled_status};
+    use super::poller::{PollReceiver, PolledDevice, Poller, plan_blocks, write_disabled_status};
     #[pymodule_export]
     use super::raw_ingest::{encode_raw_ingest, pack_raw_ingest};
     #[pymodule_export]

@@ -87,21 +87,22 @@ impl Log {
         settings.memory_file = kept_file;
         settings.servers.login = login(user, password_file, token_file, credentials_file)?;
         settings.servers.tls = tls.map(tls_of).transpose()?;
-        let core = Core::new(settings, named(&memories)).map_err(raised)?;
+        let core = Core::new(settings, named(&memories)).map_err(to_py_err)?;
         Ok(Log { core: Arc::new(core) })
     }
 
     fn resume(&self, note: &[u8]) -> PyResult<()> {
-        self.core.resume(note).map_err(raised)
+        self.core.resume(note).map_err(to_py_err)
     }
 
     fn start(&self, py: Python<'_>, timeout: f64) -> PyResult<()> {
         let timeout = seconds("timeout", timeout)?;
         let end = Instant::now() + timeout;
-        self.core.start().map_err(raised)?;
+        self.core.start().map_err(to_py_err)?;
         loop {
             let left = end.saturating_duration_since(Instant::now()).min(SLICE);
-            let caught_up = py.detach(|| self.core.wait_until_caught_up(left)).map_err(raised)?;
+            let caught_up =
+                py.detach(|| self.core.wait_until_caught_up(left)).map_err(to_py_err)?;
             if caught_up {
                 return Ok(());
             }
@@ -109,7 +110,7 @@ impl Log {
             if signalled.is_err() || Instant::now() >= end {
                 let error = self.core.no_connection(timeout);
                 py.detach(|| self.core.stop());
-                return signalled.and(Err(raised(error)));
+                return signalled.and(Err(to_py_err(error)));
             }
         }
     }
@@ -221,13 +222,13 @@ impl LogReader {
         let mut names: Vec<String> = members.iter().map(|(name, _)| name.clone()).collect();
         names.sort();
         let core = py.detach(|| CoreReader::open(&settings, members, until, timeout));
-        Ok(LogReader { core: Mutex::new(core.map_err(raised)?), names })
+        Ok(LogReader { core: Mutex::new(core.map_err(to_py_err)?), names })
     }
 
     fn next<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Bound<'py, PyDict>>> {
         let timeout = seconds("timeout", timeout)?;
-        let record = py.detach(|| self.locked(|core| core.next(timeout))).map_err(raised)?;
-        record.map(|record| self.shown(py, &record)).transpose()
+        let record = py.detach(|| self.locked(|core| core.next(timeout))).map_err(to_py_err)?;
+        record.map(|record| self.record_to_python(py, &record)).transpose()
     }
 
     #[getter]
@@ -260,7 +261,11 @@ impl LogReader {
         work(&mut lock(&self.core))
     }
 
-    fn shown<'py>(&self, py: Python<'py>, record: &Record) -> PyResult<Bound<'py, PyDict>> {
+    fn record_to_python<'py>(
+        &self,
+        py: Python<'py>,
+        record: &Record,
+    ) -> PyResult<Bound<'py, PyDict>> {
         let shown = PyDict::new(py);
         shown.set_item("sequence", record.sequence)?;
         shown.set_item("time_ns", record.stored)?;
@@ -343,7 +348,7 @@ fn tls_of((ca, cert, key): TlsFiles) -> PyResult<Tls> {
     Ok(Tls { ca, own })
 }
 
-fn raised(error: CoreError) -> PyErr {
+fn to_py_err(error: CoreError) -> PyErr {
     if let CoreError::Settings(text) = error {
         return PyValueError::new_err(text);
     }

@@ -59,7 +59,7 @@ impl MemoryFile {
         let open = if of_log { Core::open_of_log } else { Core::open };
         match py.detach(|| open(disk, members, options)) {
             Ok(core) => Ok(MemoryFile { path, core }),
-            Err(error) => Err(raised(&path, error)),
+            Err(error) => Err(to_py_err(&path, error)),
         }
     }
 
@@ -81,11 +81,11 @@ impl MemoryFile {
     #[pyo3(signature = (log=None))]
     fn start(&self, py: Python<'_>, log: Option<PyRef<'_, Log>>) -> PyResult<()> {
         let log = log.map(|log| Arc::new(OfLog(Arc::clone(&log.core))) as Arc<dyn Source>);
-        py.detach(|| self.core.start(log)).map_err(|error| raised(&self.path, error))
+        py.detach(|| self.core.start(log)).map_err(|error| to_py_err(&self.path, error))
     }
 
     fn stop(&self, py: Python<'_>) -> PyResult<()> {
-        py.detach(|| self.core.stop()).map_err(|error| raised(&self.path, error))
+        py.detach(|| self.core.stop()).map_err(|error| to_py_err(&self.path, error))
     }
 
     fn status<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
@@ -115,7 +115,7 @@ pub fn read_memory_file(
     path: PathBuf,
     set_aside: bool,
 ) -> PyResult<Bound<'_, PyDict>> {
-    let memories = py.detach(|| read(&path)).map_err(|error| raised(&path, error))?;
+    let memories = py.detach(|| read(&path)).map_err(|error| to_py_err(&path, error))?;
     let shown = PyDict::new(py);
     for kept in memories {
         let name = match kept.set_aside_of() {
@@ -140,10 +140,10 @@ pub fn read_memory_file(
 #[pyfunction]
 pub fn release_memory_file(py: Python<'_>, path: PathBuf, memory: &str) -> PyResult<bool> {
     let disk = Arc::new(FileOnDisk::new(&path));
-    py.detach(|| release(disk, memory)).map_err(|error| raised(&path, error))
+    py.detach(|| release(disk, memory)).map_err(|error| to_py_err(&path, error))
 }
 
-fn raised(path: &Path, error: FileError) -> PyErr {
+fn to_py_err(path: &Path, error: FileError) -> PyErr {
     match error {
         FileError::Memories(message) => PyValueError::new_err(message),
         // Both may pass.

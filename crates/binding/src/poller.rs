@@ -11,7 +11,7 @@ use holdfast_engine::poller::{
     self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, FIRST_POLL_SPREAD,
     ForwardSettings, Poll, Polled, Poller as Core, PollerError, ReadSettings, StatusSettings,
 };
-use holdfast_memory::Refusal;
+use holdfast_memory::{Refusal, Span};
 use holdfast_protocol::pdu::limit;
 use holdfast_runtime::Retry;
 use pyo3::exceptions::{PyOSError, PyRuntimeError, PyValueError};
@@ -57,7 +57,7 @@ pub struct PolledDevice {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl PolledDevice {
     #[new]
-    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=MAX_REGISTERS, max_bits=MAX_BITS, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, report=None, fields=None, release=false, measured=false, retry=None, jitter=true, fence=None))]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=MAX_REGISTERS, max_bits=MAX_BITS, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, receiver=None, fields=None, release=false, measured=false, retry=None, jitter=true, fence=None))]
     fn new(
         name: String,
         endpoint: PyRef<'_, Endpoint>,
@@ -75,7 +75,7 @@ impl PolledDevice {
         status: Option<(PyRef<'_, Memory>, StatusBlock)>,
         start_within: Option<f64>,
         in_flight: Option<i128>,
-        report: Option<PyRef<'_, Results>>,
+        receiver: Option<PyRef<'_, PollReceiver>>,
         fields: Option<Vec<(String, u32, u32)>>,
         release: bool,
         measured: bool,
@@ -85,7 +85,11 @@ impl PolledDevice {
     ) -> PyResult<PolledDevice> {
         let checked_range = |area: String, address, count| -> PyResult<_> {
             let address = within("address", address, 0..=65_535)? as u16;
-            Ok((named(&area)?, address, within("count", count, 1..=65_536)? as u32))
+            Ok((
+                named(&area)?,
+                address,
+                within("count", count, 1..=Span::MAX_SIZE as usize)? as u32,
+            ))
         };
         let reads = reads.into_iter().map(|(area, address, count, into)| {
             let (area, address, count) = checked_range(area, address, count)?;
@@ -115,7 +119,7 @@ impl PolledDevice {
                 Some(within) => seconds("start_within", within)?,
                 None => FIRST_POLL_SPREAD.min(seconds("interval", interval)?),
             },
-            report: report.map(|receiver| Arc::clone(&receiver.core)),
+            report: receiver.map(|receiver| Arc::clone(&receiver.core)),
             release,
             measured,
             fence: fence.map(|fence| Arc::clone(&fence.core)),
@@ -135,39 +139,41 @@ impl Poller {
     fn new(py: Python<'_>, devices: Vec<PyRef<'_, PolledDevice>>) -> PyResult<Poller> {
         let devices: Vec<DeviceSettings> =
             devices.iter().map(|device| device.core.clone()).collect();
-        let core = py.detach(|| Core::start(devices)).map_err(raised)?;
+        let core = py.detach(|| Core::start(devices)).map_err(to_py_err)?;
         Ok(Poller { core })
     }
 
     #[getter]
     fn heartbeat(&self) -> (String, f64, Option<u32>) {
-        heartbeat::shown(self.core.heartbeat())
+        heartbeat::to_python(self.core.heartbeat())
     }
 
     fn add(&self, device: PyRef<'_, PolledDevice>) -> PyResult<()> {
-        self.core.add(device.core.clone()).map_err(raised)
+        self.core.add(device.core.clone()).map_err(to_py_err)
     }
 
     #[pyo3(signature = (name, device, *, at_once=true))]
     fn replace(&self, name: &str, device: PyRef<'_, PolledDevice>, at_once: bool) -> PyResult<()> {
-        self.core.replace(name, device.core.clone(), at_once).map_err(raised)
+        self.core.replace(name, device.core.clone(), at_once).map_err(to_py_err)
     }
 
-    #[pyo3(signature = (name, request, to, *, within=None))]
+    #[pyo3(signature = (name, request, receiver, *, within=None))]
     fn write(
         &self,
         name: &str,
         request: PyRef<'_, Request>,
-        to: PyRef<'_, Results>,
+        receiver: PyRef<'_, PollReceiver>,
         within: Option<f64>,
     ) -> PyResult<u64> {
         let within = within.map(|within| seconds("within", within)).transpose()?;
         let until = within.map(|within| Instant::now() + within);
-        self.core.write(name, Box::new(request.encoded.clone()), until, &to.core).map_err(raised)
+        self.core
+            .write(name, Box::new(request.encoded.clone()), until, &receiver.core)
+            .map_err(to_py_err)
     }
 
-    fn receiver(&self) -> Results {
-        Results { core: self.core.receiver() }
+    fn new_receiver(&self) -> PollReceiver {
+        PollReceiver { core: self.core.receiver() }
     }
 
     #[pyo3(signature = (endpoint, *, in_flight=1, queue=None, coalesce=true, cache=0.0, preferred=None, retry=None))]
@@ -185,18 +191,17 @@ impl Poller {
         let preferred = preferred.unwrap_or_default();
         let settings =
             link::settings(&endpoint, (in_flight, retry), queue, coalesce, cache, preferred)?;
-        Ok(Link { core: self.core.link(settings).map_err(raised)? })
+        Ok(Link { core: self.core.link(settings).map_err(to_py_err)? })
     }
 
-    fn known_link(&self, endpoint: PyRef<'_, Endpoint>) -> PyResult<Option<Link>> {
-        let settings = link::settings(&endpoint, (Some(1), None), None, true, 0.0, Vec::new())?;
-        let known = self.core.known_link(settings).map_err(raised)?;
-        Ok(known.map(|core| Link { core }))
+    fn link_if_used(&self, endpoint: PyRef<'_, Endpoint>) -> PyResult<Option<Link>> {
+        let used = self.core.link_if_used(endpoint.core.clone()).map_err(to_py_err)?;
+        Ok(used.map(|core| Link { core }))
     }
 
     fn forget_links(&self, used: Vec<PyRef<'_, Link>>) -> PyResult<()> {
         let used: Vec<_> = used.iter().map(|link| Arc::clone(&link.core)).collect();
-        self.core.forget_links(&used).map_err(raised)
+        self.core.forget_links(&used).map_err(to_py_err)
     }
 
     fn passage(
@@ -205,26 +210,26 @@ impl Poller {
         ranges: Vec<(String, u16, u32, String, u16, bool)>,
     ) -> PyResult<Passage> {
         let passage = self.core.passage(Arc::clone(&memory.core), link::passed(ranges)?);
-        Ok(Passage { core: Arc::new(passage.map_err(raised)?) })
+        Ok(Passage { core: Arc::new(passage.map_err(to_py_err)?) })
     }
 
     fn remove(&self, name: &str) -> bool {
         self.core.remove(name)
     }
 
-    #[pyo3(signature = (*, of=None))]
+    #[pyo3(signature = (*, receiver=None))]
     fn counters<'py>(
         &self,
         py: Python<'py>,
-        of: Option<PyRef<'_, Results>>,
+        receiver: Option<PyRef<'_, PollReceiver>>,
     ) -> PyResult<Bound<'py, PyDict>> {
         let all = PyDict::new(py);
-        let is_of = |device: &Polled| match &of {
+        let is_of = |device: &Polled| match &receiver {
             Some(of) => device.report.as_ref().is_some_and(|to| Arc::ptr_eq(to, &of.core)),
             None => true,
         };
         for device in self.core.devices().into_iter().filter(is_of) {
-            let counted = state(py, &device.state)?;
+            let counted = device_state_to_python(py, &device.state)?;
             let mut forwards = Vec::new();
             for forward in &device.forwards {
                 let counters = forward.by_name().into_py_dict(py)?;
@@ -246,19 +251,19 @@ impl Poller {
 }
 
 #[pyclass(frozen, module = "holdfast")]
-pub struct Results {
+pub struct PollReceiver {
     core: Arc<poller::Results>,
 }
 
 #[pymethods]
-impl Results {
+impl PollReceiver {
     fn take<'py>(&self, py: Python<'py>, timeout: f64) -> PyResult<Option<Taken<'py>>> {
         let timeout = seconds("timeout", timeout)?;
         let Batch { polls, writes, ended, .. } = py.detach(|| self.core.take(timeout));
         if ended && polls.is_empty() && writes.is_empty() {
             return Ok(None);
         }
-        let polls = polls.iter().map(|poll| reported(py, poll)).collect::<PyResult<_>>()?;
+        let polls = polls.iter().map(|poll| poll_to_python(py, poll)).collect::<PyResult<_>>()?;
         let writes = writes.iter();
         let writes = writes.map(|done| (done.ticket, done.outcome.err().map_or(0, Fault::code)));
         Ok(Some((polls, writes.collect())))
@@ -274,7 +279,7 @@ impl Results {
     }
 }
 
-fn raised(error: PollerError) -> PyErr {
+fn to_py_err(error: PollerError) -> PyErr {
     match error {
         PollerError::Thread(_) => PyOSError::new_err(error.to_string()),
         PollerError::Stopped => PyRuntimeError::new_err(error.to_string()),
@@ -298,6 +303,7 @@ pub fn plan_blocks(
         Ok(Field {
             area: named(&area)?,
             address: within("address", address, 0..=65_535)? as u16,
+            // No request carries as many.
             count: within("count", count, 1..=65_535)? as u16,
         })
     });
@@ -402,7 +408,7 @@ type Taken<'py> = (Vec<PollResult<'py>>, Vec<(u64, u16)>);
 type PollResult<'py> = (String, f64, Vec<ReportedBlock<'py>>);
 type ReportedBlock<'py> = (Cow<'static, str>, u16, u16, Option<Bound<'py, PyBytes>>, u16, f64);
 
-fn reported<'py>(py: Python<'py>, poll: &Poll) -> PyResult<PollResult<'py>> {
+fn poll_to_python<'py>(py: Python<'py>, poll: &Poll) -> PyResult<PollResult<'py>> {
     let blocks = poll.blocks.iter().map(|block| {
         let (bytes, fault) = match &block.outcome {
             Ok(bytes) => (Some(PyBytes::new(py, bytes)), 0),
@@ -417,7 +423,10 @@ fn reported<'py>(py: Python<'py>, poll: &Poll) -> PyResult<PollResult<'py>> {
     Ok((poll.device.to_string(), poll.due.as_secs_f64(), blocks.collect()))
 }
 
-fn state<'py>(py: Python<'py>, state: &DeviceState) -> PyResult<Bound<'py, PyDict>> {
+fn device_state_to_python<'py>(
+    py: Python<'py>,
+    state: &DeviceState,
+) -> PyResult<Bound<'py, PyDict>> {
     let shown = PyDict::new(py);
     shown.set_item("health", state.health().name())?;
     shown.set_item("last_error", state.last_error())?;

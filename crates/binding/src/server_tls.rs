@@ -51,8 +51,8 @@ impl ServerTls {
 /// Settings of the TLS of an HTTPS server. Reads the PEM files at once.
 ///
 /// Without `client_ca_file`, clients need no certificate. `roles` are the allowed roles of their
-/// certificates: "" is a certificate without a role, `None` is any role. The rest is that of
-/// `ServerTls`, also what it raises.
+/// certificates: "" is a certificate without a role, `None` is any role. The other arguments and the
+/// exceptions are those of `ServerTls`.
 #[pyfunction]
 #[pyo3(signature = (*, cert_file, key_file, client_ca_file=None, crl_file=None, roles=None, decrypted_key=None))]
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
@@ -83,8 +83,8 @@ impl ServerTls {
             return Ok(Arc::clone(&self.core));
         }
         Err(PyValueError::new_err(match protocol {
-            Protocol::Http => "tls is that of a listener, allowed: https_server_tls(cert_file=…)",
-            Protocol::Modbus => "tls is that of an HTTPS server, allowed: ServerTls(cert_file=…)",
+            Protocol::Http => "tls is for a Modbus listener; use https_server_tls(...)",
+            Protocol::Modbus => "tls is for an HTTPS server; use ServerTls(...)",
         }))
     }
 }

@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from holdfast._core import plan_blocks
+from holdfast._core import RETRY_REFUSED_AFTER_S, plan_blocks
 from holdfast.client.requests import carry_out, carry_out_async
 from holdfast.errors import (
     ConnectFailed,
@@ -31,10 +31,8 @@ if TYPE_CHECKING:
     from holdfast.types import Area
 
 MAX_UNANSWERED = 3
-"""Requests in a row without an answer that end a reading."""
-
-REFUSAL_RETRY_S = 60.0
-"""Seconds after which what the device refuses is tried again."""
+"""Requests in a row without an answer that end a reading: a device that is off does not cost a
+timeout for each block."""
 
 ILLEGAL = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)
 """Exceptions that depend on the request, not on the state of the device."""
@@ -168,7 +166,7 @@ class TagReader:
     def _plan(self) -> None:
         """Makes blocks of all tags, at first and some time after a refusal."""
         now = self._clock()
-        if self._blocks and (self._is_as_planned or now - self._planned < REFUSAL_RETRY_S):
+        if self._blocks and (self._is_as_planned or now - self._planned < RETRY_REFUSED_AFTER_S):
             return
         self._planned, self._is_as_planned = now, True
         fields: dict[tuple[Area, int, int], _Field] = {}

@@ -100,9 +100,9 @@ class Shared:
     def _known_link(self, target: NetworkTarget) -> Link | None:
         """Returns the link to a target that the appliance uses now."""
         if target.transport != "tls":
-            return self._poller.known_link(_plain_endpoint(target))
+            return self._poller.link_if_used(_plain_endpoint(target))
         known = self._endpoints.get(target)
-        return None if known is None else self._poller.known_link(known[0])
+        return None if known is None else self._poller.link_if_used(known[0])
 
 
 @lru_cache(MAX_ENDPOINTS)

@@ -45,7 +45,7 @@ class Recording:
 
     def begin(self) -> None:
         """The commands were checked. Raises `Unrecorded`."""
-        if self._writes.is_refusable:
+        if self._writes.can_be_refused:
             self._audit.require()
         else:
             self._group = self._audit.queue(self._lines("done"))

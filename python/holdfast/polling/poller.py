@@ -74,7 +74,7 @@ class Poller:
     def __init__(self, *, gather: float = 0.01) -> None:
         self._gather = checked_seconds("gather", gather, MAX_TIMEOUT_S, 0)
         self._poller = _core.Poller([])
-        self._results = self._poller.receiver()
+        self._results = self._poller.new_receiver()
         self._readers: dict[str, Reader] = {}
         """By the name in the core, see `_core_names`."""
         self._core_names: dict[str, str] = {}
@@ -154,7 +154,7 @@ class Poller:
                 timeout=timeout,
                 reads=[],
                 fields=list(reader.fields),
-                report=self._results,
+                receiver=self._results,
                 max_gap=max_gap,
                 max_registers=max_registers,
                 max_bits=max_bits,
@@ -200,7 +200,7 @@ class Poller:
         [request] = write_typed(
             of.area, of.address, raw, of.type, of.order, of.encoding, split=False
         )
-        writing = self._poller.receiver()
+        writing = self._poller.new_receiver()
         number = self._poller.write(core_name, request, writing)
         while True:
             results = writing.take(SIGNAL_CHECK_S)

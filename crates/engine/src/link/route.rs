@@ -44,6 +44,19 @@ impl LinkSettings {
     pub const QUEUE: usize = 256;
     /// The largest such number that a link can have.
     pub const MAX_QUEUE: usize = 65_535;
+
+    /// The default settings.
+    pub fn new(endpoint: Endpoint) -> LinkSettings {
+        LinkSettings {
+            endpoint,
+            in_flight: InFlight::Fixed(1),
+            retry: Retry::default(),
+            queue: LinkSettings::QUEUE,
+            coalesce: true,
+            cache: Duration::ZERO,
+            preferred: Vec::new(),
+        }
+    }
 }
 
 counters! {

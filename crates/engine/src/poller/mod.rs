@@ -31,6 +31,7 @@ pub use destination::{Destination, ReadSettings};
 pub use device::DeviceSettings;
 pub use forwarding::{ForwardCounters, ForwardFailure, ForwardSettings};
 pub use mirror_age::MirrorAge;
+pub use remembered_refusals::RETRY_REFUSED_AFTER;
 pub use results::{Batch, BlockResult, Poll, Results, Written};
 pub use schedule::FIRST_POLL_SPREAD;
 pub use state::{DeviceCounters, DeviceState};

@@ -12,8 +12,8 @@ use crate::link::Fault;
 /// The limits are forgotten after this time, and the device is searched again.
 const FORGET_AFTER: Duration = Duration::from_secs(600);
 
-/// The interval between attempts to read an unreadable range.
-const RETRY_REFUSED_AFTER: Duration = Duration::from_secs(60);
+/// The interval between attempts to read an unreadable range: a change of the device can make it readable.
+pub const RETRY_REFUSED_AFTER: Duration = Duration::from_secs(60);
 
 #[derive(Debug, Default)]
 pub(super) struct Learned {

@@ -288,14 +288,12 @@ impl Poller {
     }
 
     /// The link to an address that a device or another user of a link already has; `None` if there is
-    /// none.
+    /// none. If only devices have it, creates the link, with default settings.
     ///
     /// # Errors
     /// [`PollerError::Stopped`].
-    pub fn known_link(
-        &self,
-        mut settings: LinkSettings,
-    ) -> Result<Option<Arc<SharedLink>>, PollerError> {
+    pub fn link_if_used(&self, endpoint: Endpoint) -> Result<Option<Arc<SharedLink>>, PollerError> {
+        let mut settings = LinkSettings::new(endpoint);
         let address = address(&settings.endpoint);
         let polled = lock(&self.polled);
         let polled = polled.values().filter(|device| *device.address == address);

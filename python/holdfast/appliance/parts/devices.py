@@ -87,7 +87,7 @@ class Devices(Part):
             plan.undo.callback(poller.stop)
         if poller is not None:
             if values is None and any(config.devices[name].has_tags for name in polled):
-                values = TagValues(poller.receiver(), self._began)
+                values = TagValues(poller.new_receiver(), self._began)
                 writes = TagWrites(poller, self._audit.log, values.find)
             # The first use of an address decides the settings of its connection: links first.
             plan.links = native_links.links(config, plan.memories, poller, withdrawals)

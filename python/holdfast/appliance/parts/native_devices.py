@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 def device(
     name: str,
     plan: Plan,
-    report: _core.Results | None,
+    receiver: _core.PollReceiver | None,
     fence: _core.Fence | None = None,
 ) -> _core.PolledDevice:
     """Creates the native poller's device of that name. Raises `OSError` for unusable files.
 
-    `report` takes the polls of devices with tags. A `fence` stops polls while it is closed.
+    `receiver` takes the polls of devices with tags. A `fence` stops polls while it is closed.
     """
     config, memories = plan.config, plan.memories
     settings = config.devices[name]
@@ -63,7 +63,7 @@ def device(
         in_flight=None if settings.in_flight == "auto" else settings.in_flight,
         retry=settings.retry.pauses,
         measured=settings.max_gap == "auto",
-        report=report if fields else None,
+        receiver=receiver if fields else None,
         fields=fields,
         fence=fence,
         **read_plans.rules(settings),

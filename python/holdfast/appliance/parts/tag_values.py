@@ -29,7 +29,7 @@ from holdfast.runtime.heartbeat import Heartbeat
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
-    from holdfast._core import Results
+    from holdfast._core import PollReceiver
     from holdfast.config import Config
     from holdfast.config.models.devices import DeviceConfig
     from holdfast.config.models.outputs import Output
@@ -106,7 +106,7 @@ class TagValues:
     Ends with the poller.
     """
 
-    def __init__(self, results: Results, began: float) -> None:
+    def __init__(self, results: PollReceiver, began: float) -> None:
         """`began` is when the poller was created, by `time.monotonic`."""
         self.results = results
         self._began = began

@@ -50,7 +50,7 @@ class TagWrites:
         self, poller: Poller, audit: Audit | None, find: Callable[[str, str], Tag | None]
     ) -> None:
         self._poller, self._audit, self._find = poller, audit, find
-        self._results = poller.receiver()
+        self._results = poller.new_receiver()
         self._changed = threading.Condition()
         self._pending: dict[int, _Write] = {}
         self._gives_up_at = inf

@@ -61,7 +61,7 @@ class AllowedDevices:
             # The appliance may be connected to the device by its name, and a device may accept
             # no second connection. Then the link of the appliance is used.
             by_name = endpoint_of(target, self._tls)
-            if self._shared_poller.known_link(by_name) is not None:
+            if self._shared_poller.link_if_used(by_name) is not None:
                 return address, by_name
         return address, endpoint_of(address, self._tls)
 

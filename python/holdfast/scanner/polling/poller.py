@@ -99,7 +99,7 @@ class Polling:
         self._on_poll = on_poll
         self._loop = asyncio.get_running_loop()
         self._poller = _core.Poller([]) if self._shared_poller is None else self._shared_poller
-        self._results = self._poller.receiver()
+        self._results = self._poller.new_receiver()
         self._thread.start()
 
     def renew(self, device: ScannedDevice, *, at_once: bool = True) -> None:
@@ -217,7 +217,7 @@ class Polling:
             forbidden=plan.forbidden,
             # A device that was taken over has waited already.
             start_within=min(interval if fence is None else interval / 2, FIRST_POLL_SPREAD_S),
-            report=self._results,
+            receiver=self._results,
             release=source.release,
             retry=self._exact_pauses_s,
             jitter=self._exact_pauses_s is None,
@@ -226,7 +226,7 @@ class Polling:
 
     def counters(self) -> dict[str, dict[str, Any]]:
         """Returns the poller's counters of each device, by its name in the poller."""
-        return self._poller.counters(of=self._results)
+        return self._poller.counters(receiver=self._results)
 
     @property
     def dropped(self) -> int:
