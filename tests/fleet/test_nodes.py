@@ -750,13 +750,13 @@ def test_times_of_subscriptions_that_ended_are_forgotten(
 def test_one_node_or_all_are_shut_down(node: Callable[..., Running], caller: Caller) -> None:
     one, two = node("a"), node("b")
     share(one, two)
-    for payload in ({"node": "nobody"}, {"Node": "a"}, {"node": "a", "force": True}, {}):
+    for payload in ({"node": "b-2"}, {"Node": "a"}, {"node": "a", "x": 1}, {"node": None}):
         caller.publish("modbus.shutdown", payload)
     caller.publish("modbus.shutdown", {"node": "a"})
     wire.until(one.ended.done, "the node ends")
     share(two)
     assert not two.ended.done()
-    caller.publish("modbus.shutdown")
+    caller.publish("modbus.shutdown", {})
     wire.until(two.ended.done, "the other node ends")
     with pytest.raises((NoAnswer, Exception)):
         caller.request("modbus.browse", "")

@@ -84,7 +84,7 @@ class FleetPlacement(FleetMember):
 
     def is_addressed(self, payload: bytes, /) -> bool:
         """Whether a shutdown message is for all nodes, or for this one."""
-        if not payload.strip():
+        if payload.strip() in (b"", b"{}"):
             return True
         try:
             node = msgspec.json.decode(payload, type=ShutdownRequest).node
