@@ -737,7 +737,9 @@ impl OneAtATime {
         }
         // First of all: where a thread wakes up late, its request is sent late, and not given up unsent.
         self.transmit(flights, now);
-        let begun = flights.first().filter(|flight| flight.deadline <= now).and_then(|flight| {
+        let was_sent = matches!(self.state, State::Sent { .. });
+        let due = flights.first().filter(|flight| was_sent && flight.deadline <= now);
+        let begun = due.and_then(|flight| {
             let Tolerance { pad, accept_unit, .. } = flights.tolerance;
             let is_unit = |found| accept_unit.accepts(flight.unit_id, found);
             self.begun(pad, &flight.request, is_unit)
