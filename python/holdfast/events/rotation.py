@@ -1,4 +1,8 @@
-"""Puts full files aside: FILE becomes FILE.1, FILE.1 becomes FILE.2 and so on."""
+"""Puts full files aside: FILE becomes FILE.1, FILE.1 becomes FILE.2 and so on.
+
+Who writes a file decides when it is full: `audit/file.py`, `outputs/text_file.py`, and the log of
+the Windows service.
+"""
 
 from __future__ import annotations
 

@@ -30,7 +30,8 @@ SEND_AGAIN = "send it again if it is still wanted"
 class Lateness:
     """Refuses the commands that the server may have sent before the end of a standstill.
 
-    Afterwards the server is pinged: what it sends after its answer is new.
+    Afterwards the server is pinged: what it sends after its answer is new. How long a standstill is
+    at least, `runtime.standstill` decides.
     """
 
     def __init__(self, standstill_s: float) -> None:

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from holdfast.protocol import WRITE_LIMITS
-from holdfast.tags.rounding import ROUNDING_OF_WRITES
+from holdfast.tags.rounding import ROUNDING_OF_WRITES, nearest_step
 from holdfast.tags.scale import RegisterScale, ScaledTag, is_finite
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
@@ -99,7 +99,7 @@ class WritableTag(ScaledTag):
         exact = self._linear.number(value)
         if exact.denominator == 1:
             return exact.numerator
-        nearest = round(exact)  # Of two equally near ones the even one.
+        nearest = nearest_step(exact)
         rounded = self._linear.value(nearest)
         if rounded == value:
             return nearest  # A read returns this value: a float has not all digits of the scale.

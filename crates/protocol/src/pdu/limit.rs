@@ -1,5 +1,5 @@
 //! The most items per request (V1.1b3, 6). `Range` and the types of data check them; `Request::parse` says which
-//! exception more of them have.
+//! exception more of them have. For a FIFO queue, which has its length in memory, the server does.
 
 /// Coils or discrete inputs that functions 1 and 2 read.
 pub const READ_BITS: u16 = 2000;

@@ -9,7 +9,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from holdfast.adapters.mqtt.connection import BrokerConnection
-from holdfast.adapters.mqtt.inbox import Filters, Inbox, Value
+from holdfast.adapters.mqtt.inbox import Filters, Inbox
+from holdfast.adapters.mqtt.plain_values import PlainValue
 from holdfast.adapters.mqtt.response_topics import Answers
 from holdfast.adapters.mqtt.sessions import session_of
 from holdfast.adapters.mqtt.subscriptions import Subscriptions
@@ -66,7 +67,7 @@ class Mqtt:
         self._pauses = first_pause, max_pause
         self._broker = joined(settings.host, settings.port)
         filters = Filters(settings.subscriptions)
-        values = {topic: Value(topic, each) for topic, each in (mapped or {}).items()}
+        values = {topic: PlainValue(topic, each) for topic, each in (mapped or {}).items()}
         self._inbox = Inbox(memory_access, filters, values, self._broker)
         self._answers = Answers(filters, values)
         session = session_of(self._broker, settings.client_id)

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast.adapters.mqtt.connection import BrokerConnection
-    from holdfast.adapters.mqtt.inbox import Filters, Value
+    from holdfast.adapters.mqtt.inbox import Filters
+    from holdfast.adapters.mqtt.plain_values import PlainValue
     from holdfast.net.mqtt.packets import Publish
 
 
@@ -28,7 +29,7 @@ MAX_WAITING_ANSWERS = 100
 class Answers:
     """Sends and counts answers."""
 
-    def __init__(self, filters: Filters, values: Mapping[str, Value]) -> None:
+    def __init__(self, filters: Filters, values: Mapping[str, PlainValue]) -> None:
         self._filters, self._values = filters, values
         self.sent = 0
         self.dropped = 0

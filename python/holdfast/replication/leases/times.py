@@ -33,7 +33,7 @@ class LeaseTimes:
     @property
     def unheld_s(self) -> float:
         """So long a lease may be without news and without a holder while all is well: it has ended,
-        the bucket was lost, and another node needs time to take it."""
+        the bucket was lost, and another node needs time to take it. Then nodes are not ready."""
         return self.ttl_s + 2 * self.settle_s
 
     @property
