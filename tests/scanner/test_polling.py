@@ -46,7 +46,7 @@ def handled(polls: list[Poll], wanted: int) -> tuple[list[tuple[str, float]], in
 
     async def run() -> tuple[list[tuple[str, float]], int, list[str]]:
         results, came, order = Results(polls), [], []
-        core = SimpleNamespace(receiver=lambda: results, remove=lambda _: None)
+        core = SimpleNamespace(new_receiver=lambda: results, remove=lambda _: None)
         polling = Polling(cast("_core.Poller", core))
         done = asyncio.Event()
 
@@ -101,7 +101,7 @@ def test_a_poll_that_can_t_be_handled_costs_no_other() -> None:
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(lambda _, context: problems.append(context))
         results = Results([poll("a", 1, 0.0), poll("b", 1, 0.0)])
-        core = SimpleNamespace(receiver=lambda: results, remove=lambda _: None)
+        core = SimpleNamespace(new_receiver=lambda: results, remove=lambda _: None)
         polling, done = Polling(cast("_core.Poller", core)), asyncio.Event()
 
         def on_poll(device: Any, _due: float, _blocks: Any) -> None:
@@ -127,7 +127,7 @@ def test_polls_that_wait_are_not_handled_after_the_end(monkeypatch: pytest.Monke
 
     async def run() -> list[float]:
         results = Results([poll("a", at, 0.0) for at in range(100)])
-        core = SimpleNamespace(receiver=lambda: results, remove=lambda _: None)
+        core = SimpleNamespace(new_receiver=lambda: results, remove=lambda _: None)
         polling, began = Polling(cast("_core.Poller", core)), asyncio.Event()
         came: list[float] = []
 
