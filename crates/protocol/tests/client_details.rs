@@ -7,7 +7,7 @@ use std::time::Duration;
 use holdfast_protocol::client::{
     Closed, Connection, Done, Echo, Failure, GUARD, InvalidResponse, Strays, Tolerance, Transport,
 };
-use holdfast_protocol::frame::{ascii, mbap, rtu};
+use holdfast_protocol::frame::{FrameError, ascii, mbap, rtu};
 use holdfast_protocol::pdu::{EncodedRequest, Range, Request, Response};
 
 const MS: Duration = Duration::from_millis(1);
@@ -698,5 +698,90 @@ fn a_pdu_that_is_empty_or_too_long_has_no_frame() {
         assert_eq!(mbap::encode(1, 7, pdu, &mut [0; mbap::MAX_LEN]), None);
         assert_eq!(rtu::encode(7, pdu, &mut [0; rtu::MAX_LEN]), None);
         assert_eq!(ascii::encode(7, pdu, &mut [0; ascii::MAX_LEN]), None);
+    }
+}
+
+/// Lets a request be sent on a line of 5 ms a character. Returns how long the line carries it.
+fn send_on_a_slow_line(client: &mut Client, request: &EncodedRequest) -> Duration {
+    client.send(request);
+    while client.connection.outgoing().is_empty() {
+        client.after(client.connection.deadline().unwrap() - client.now);
+    }
+    5 * MS * client.outgoing().len() as u32
+}
+
+fn write_of_100_registers() -> EncodedRequest {
+    EncodedRequest::parse(&[&[16, 0, 0, 0, 100, 200][..], &[0; 200]].concat()).unwrap()
+}
+
+fn on_a_slow_line() -> Client {
+    let mut client = Client::new(RTU, Tolerance::default());
+    client.connection = Connection::new(RTU).on_line(5 * MS);
+    client
+}
+
+#[test]
+fn on_a_line_faster_than_its_settings_the_reply_after_a_damaged_one_answers_no_other_request() {
+    let mut client = on_a_slow_line();
+    let confirmation = rtu_frame(&[16, 0, 0, 0, 100]);
+    for _ in 0..2 {
+        send_on_a_slow_line(&mut client, &write_of_100_registers());
+        client.after(60 * MS);
+        client.receive(&confirmation);
+        while client.got.is_empty() {
+            client.after(client.connection.deadline().unwrap() - client.now);
+        }
+        assert_eq!(client.got().len(), 1);
+    }
+    send_on_a_slow_line(&mut client, &write_of_100_registers());
+    client.after(MS);
+    client.receive(&[7, 0x90, 1, 2, 3]);
+    assert!(matches!(client.got()[..], [Err(Failure::Invalid(_))]));
+    client.send(&write_of_100_registers());
+    client.after(59 * MS);
+    assert_eq!(client.outgoing(), []);
+    client.receive(&confirmation);
+    assert_eq!((client.got(), client.connection.late()), (vec![], 1));
+}
+
+#[test]
+fn a_late_reply_does_not_shorten_the_time_of_a_request_that_the_line_still_carries() {
+    let mut client = on_a_slow_line();
+    client.send(&read(1));
+    client.outgoing();
+    client.after(client.connection.deadline().unwrap() - client.now);
+    assert_eq!(client.got(), [Err(Failure::Timeout)]);
+    let carried = send_on_a_slow_line(&mut client, &write_of_100_registers());
+    let ends = client.now + carried + SECOND;
+    client.after(MS);
+    client.receive(&rtu_frame(&[3, 2, 0, 1]));
+    assert_eq!((client.connection.late(), client.connection.deadline()), (1, Some(ends)));
+}
+
+#[test]
+fn after_an_early_invalid_reply_the_next_request_waits_until_the_line_has_carried_the_one_before() {
+    let mut client = on_a_slow_line();
+    let carried = send_on_a_slow_line(&mut client, &write_of_100_registers());
+    client.receive(&[7, 0x90, 1, 2, 3]);
+    assert_eq!(client.got().len(), 1);
+    client.send(&read(1));
+    client.after(carried);
+    assert_eq!(client.outgoing(), []);
+}
+
+#[test]
+fn one_byte_can_be_noise_and_prolongs_no_further_than_the_reply_is_long() {
+    for (bytes, expected) in [
+        (&[7][..], Failure::Timeout),
+        (&[0xFF, 7], Failure::Invalid(InvalidResponse::Frame(FrameError::CheckSum))),
+    ] {
+        let mut client = on_a_slow_line();
+        let carried = send_on_a_slow_line(&mut client, &EncodedRequest::new(&WRITE));
+        client.receive(bytes);
+        client.after(carried + SECOND);
+        // A confirmation has 8 bytes.
+        assert_eq!(client.connection.deadline(), Some(client.now + 7 * 5 * MS + GUARD));
+        client.after(7 * 5 * MS + GUARD);
+        assert_eq!(client.got(), [Err(expected)]);
     }
 }

@@ -171,7 +171,9 @@ impl Waiting {
 
     pub(crate) fn end(mut self, outcome: Result<Vec<u8>, Arc<ClientError>>) {
         self.has_ended = true;
-        let is_over = matches!(&outcome, Err(error) if matches!(**error, ClientError::Timeout(_)));
+        let is_over = outcome.as_ref().is_err_and(|error| {
+            matches!(**error, ClientError::Timeout(_) | ClientError::Incomplete(_))
+        });
         let outcome = if self.is_broadcast && is_over { Ok(Vec::new()) } else { outcome };
         self.caller.end(self.ticket, outcome);
     }
@@ -279,6 +281,9 @@ mod tests {
         let (_, waiting) = caller.begin(&read(), TIMEOUT, true);
         assert_eq!(waiting.reply_timeout(), BROADCAST_TIMEOUT);
         waiting.end(Err(Arc::new(ClientError::Timeout(BROADCAST_TIMEOUT))));
+        assert_eq!(caller.take()[0].outcome.as_ref().ok(), Some(&Vec::new()));
+        let (_, waiting) = caller.begin(&read(), TIMEOUT, true);
+        waiting.end(Err(Arc::new(ClientError::Incomplete(BROADCAST_TIMEOUT))));
         assert_eq!(caller.take()[0].outcome.as_ref().ok(), Some(&Vec::new()));
     }
 }

@@ -262,7 +262,7 @@ impl Flights {
     /// Starts the timeout of the first request again.
     pub(super) fn restart(&mut self, now: Time) {
         if let Some(flight) = self.waiting.front_mut() {
-            flight.deadline = now + flight.timeout;
+            flight.deadline = now.max(flight.sent) + flight.timeout;
         }
     }
 

@@ -229,7 +229,8 @@ impl LateReplies {
         };
     }
 
-    /// Until when the reply may come to a request that ended without it.
+    /// Until when the reply may come to a request that ended without it, maybe before it counts as sent: a line can
+    /// be faster than its settings say.
     fn until_after(
         &mut self,
         unit_id: u8,
@@ -252,14 +253,18 @@ impl LateReplies {
                 // It may have been given up as late as by a timeout.
                 let is_silent = how == Ended::WithConnection;
                 let took = if is_silent { now.saturating_sub(sent) } else { Duration::ZERO };
-                now + usual
-                    .unwrap_or(GUARD)
-                    .max(left)
-                    .max(took * (LATENESS_FACTOR - 1))
-                    .min(MAX_LATENESS)
+                now.max(sent)
+                    + usual
+                        .unwrap_or(GUARD)
+                        .max(left)
+                        .max(took * (LATENESS_FACTOR - 1))
+                        .min(MAX_LATENESS)
             }
             Ended::Broadcast => sent + timeout,
-            Ended::Damaged => (sent + timeout).min(now + usual.unwrap_or(WAIT_AFTER_DAMAGED_REPLY)),
+            Ended::Damaged => {
+                let most = usual.unwrap_or(WAIT_AFTER_DAMAGED_REPLY);
+                (sent + timeout).min(now.max(sent) + most)
+            }
         }
     }
 

@@ -22,7 +22,7 @@ pub(super) struct Lateness {
 #[derive(Debug, Default)]
 struct Unit {
     /// The longest time of a reply that was not late.
-    longest: Option<Duration>,
+    longest: Duration,
     /// The longest time of a late reply.
     latest: Duration,
     /// Late replies since the last of [`RESET_AFTER_TIMELY_REPLIES`] that were not.
@@ -60,7 +60,7 @@ impl Lateness {
 
     /// The longest time of a reply of this unit that was not late; `None` if there was none.
     pub(super) fn longest(&self, unit_id: u8) -> Option<Duration> {
-        self.units.get(&unit_id)?.longest
+        self.units.get(&unit_id).map(|unit| unit.longest).filter(|longest| !longest.is_zero())
     }
 
     /// The longest time of a late reply of this unit.
@@ -80,7 +80,7 @@ impl Lateness {
     pub(super) fn answered(&mut self, unit_id: u8, took: Duration, timeout: Duration) {
         let unit = self.units.entry(unit_id).or_default();
         unit.note_timeout(timeout);
-        unit.longest = unit.longest.max(Some(took.min(timeout)));
+        unit.longest = unit.longest.max(took.min(timeout));
         if took > timeout {
             unit.in_time = 0;
             unit.latest = unit.latest.max(took);
@@ -89,7 +89,7 @@ impl Lateness {
         unit.in_time += 1;
         if unit.in_time == RESET_AFTER_TIMELY_REPLIES {
             let former_timeout = unit.timeout;
-            *unit = Unit { longest: Some(took), former_timeout, ..Unit::default() };
+            *unit = Unit { longest: took, former_timeout, ..Unit::default() };
         }
     }
 }

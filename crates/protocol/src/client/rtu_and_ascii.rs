@@ -383,9 +383,12 @@ impl OneAtATime {
         is_unit: impl Fn(u8) -> bool,
     ) -> Option<(usize, usize)> {
         let pdu_len = |bytes: &[u8]| {
-            let is_of_function = |code: &u8| Some(code & 0x7F) == request.pdu().first().copied();
-            let fits = is_unit(*bytes.first()?) && bytes.get(1).is_none_or(is_of_function);
-            let len = response_len(bytes, request).ok().filter(|_| fits)?;
+            let (unit_id, function) = (*bytes.first()?, *request.pdu().first()?);
+            if !is_unit(unit_id) || bytes.get(1).is_some_and(|code| code & 0x7F != function) {
+                return None;
+            }
+            let start = [unit_id, function];
+            let len = response_len(if bytes.len() > 1 { bytes } else { &start }, request).ok()?;
             let usual = read_bytes(request).map_or(rtu::MAX_LEN, |count| count + 5);
             self.may_come(pads, request, bytes, len).then(|| len.unwrap_or(usual) - 3)
         };
@@ -638,7 +641,8 @@ impl OneAtATime {
             _ => Ended::Damaged,
         };
         self.note_ended(flights, how, now);
-        self.rest(now);
+        // The line may still carry the request.
+        self.rest(flights.first().map_or(now, |flight| now.max(flight.sent)));
         flights.finish(Err(Failure::Invalid(invalid)), sink);
         if self.silence.is_none() {
             flights.close(Closed::Invalid(invalid), sink);
@@ -765,7 +769,8 @@ impl OneAtATime {
             let invalid = too_fast.or(self.stray.map(InvalidResponse::Frame));
             let failure = match invalid {
                 Some(invalid) => Failure::Invalid(invalid),
-                None if begun.is_some() => Failure::Incomplete,
+                // One byte can be noise.
+                None if begun.is_some_and(|(received, _)| received > 1) => Failure::Incomplete,
                 // An earlier attempt was sent, and got no reply.
                 None if sent || self.repeats => Failure::Timeout,
                 None => Failure::NoSilence,
@@ -812,7 +817,7 @@ impl OneAtATime {
                 },
                 Ok(len) if fits && self.may_come(pad, &flight.request, bytes, len) => {
                     // If the rest does not come, what was found before it is why there is no reply.
-                    self.stray = failure;
+                    self.stray = failure.or(self.stray.filter(|_| bytes.len() == 1));
                     return Ok(None);
                 }
                 Ok(_) => self.stray = Some(FrameError::CheckSum),
