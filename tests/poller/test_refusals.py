@@ -60,7 +60,7 @@ def requests(fake: Fake, poller: ReportingPoller) -> list[tuple[int, int]]:
     return sorted({asked(request) for request in fake.requests[-per_poll:]})
 
 
-@pytest.mark.parametrize("code", [2, 3, 4])
+@pytest.mark.parametrize("code", [2, 3])
 @pytest.mark.parametrize("bad", [0, 50, 124])
 def test_one_bad_address_costs_its_own_read_and_one_more_request(
     poller: ReportingPoller, code: int, bad: int
@@ -162,35 +162,6 @@ def test_a_device_that_refuses_everything_is_asked_all_the_same(poller: Reportin
         wire.until(lambda: poller.counters()["a"]["health"] == "ok", "it is read again")
 
 
-def test_a_device_that_fails_is_searched_once_and_asked_with_each_poll(
-    poller: ReportingPoller,
-) -> None:
-    with Fake(without(range(65536), 4)) as fake:
-        poller.add(device(fake, interval=INTERVAL, reads=fields(range(64))))
-        polls, _ = taken(poller, lambda polls, _: len(polls) > 20)
-        assert {fault for _, _, blocks in polls for *_, fault, _ in blocks} == {4}
-        fake.answer = data
-        wire.until(lambda: poller.counters()["a"]["health"] == "ok", "it is read again")
-        counters = poller.counters()["a"]
-        assert counters["exceptions"] <= 127 + counters["polls"]
-
-
-def test_what_a_device_failed_to_read_for_a_moment_is_tried_again_with_the_next_poll(
-    poller: ReportingPoller,
-) -> None:
-    """It fails until the field has been asked for alone."""
-
-    def answer(request: wire.Frame) -> bytes | None:
-        return without([0] if len(fake.requests) <= 4 else [], 4)(request)
-
-    with Fake(answer) as fake:
-        poller.add(device(fake, interval=INTERVAL, reads=fields(range(8))))
-        polls, _ = taken(poller, lambda polls, _: len(polls) > 1)
-        assert [asked(request) for request in fake.requests[:4]] == [(0, 8), (0, 4), (0, 2), (0, 1)]
-        faults = [{at: fault for _, at, _, _, fault, _ in blocks} for _, _, blocks in polls[:2]]
-        assert (faults[0][0], faults[1][0]) == (4, 0)
-
-
 def test_a_device_whose_replies_are_wrong_is_given_a_rest(poller: ReportingPoller) -> None:
     def answer(request: wire.Frame) -> bytes:
         return wire.frame(b"\x03\x02\0\0", 9, request.transaction)
@@ -219,7 +190,7 @@ def test_a_write_that_succeeds_ends_a_rest(poller: ReportingPoller) -> None:
 @given(
     st.sets(st.integers(0, 60), min_size=1, max_size=40),
     st.sets(st.integers(0, 61), max_size=8),
-    st.sampled_from([2, 3, 4]),
+    st.sampled_from([2, 3]),
     st.integers(1, 3),
     st.integers(0, 10),
 )

@@ -5,20 +5,14 @@ use super::device::{Device, Gathered};
 use super::plan::{self, Block};
 use crate::link::Fault;
 
-/// Exceptions that depend on the request. The last can also depend on the state of the device.
-const ILLEGAL: [u8; 3] = [2, ILLEGAL_VALUE, DEVICE_FAILURE];
+/// Exceptions that depend on the request, not on the state of the device.
+const ILLEGAL: [u8; 2] = [2, ILLEGAL_VALUE];
 const ILLEGAL_VALUE: u8 = 3;
-const DEVICE_FAILURE: u8 = 4;
 
 impl Fault {
     /// Whether it means that an address does not exist, or that the request is too large.
     pub(super) fn is_illegal(self) -> bool {
         matches!(self, Fault::Exception(code) if ILLEGAL.contains(&code))
-    }
-
-    /// Whether it can mean that the device fails for a while: many devices answer 04 in place of 02.
-    pub(super) fn may_pass(self) -> bool {
-        self == Fault::Exception(DEVICE_FAILURE)
     }
 }
 

@@ -496,7 +496,7 @@ impl Device {
         }
         let mut answered = gathered.answered;
         if answered || plan.is_empty() {
-            fault = fault.or(self.look_at_unreadable(due, &known, &mut gathered).await);
+            fault = fault.or(self.look_at_unreadable(&known, &mut gathered).await);
             if fault == Some(Fault::Standby) {
                 return;
             }
@@ -532,16 +532,15 @@ impl Device {
         }
     }
 
-    /// Reports the unreadable ranges known before this poll, and tries one of them again from time to
-    /// time. Returns the fault of one of them.
+    /// Reports unreadable ranges, and tries one of them again from time to time. Returns the fault
+    /// of one of them.
     async fn look_at_unreadable(
         &self,
-        due: Instant,
         known: &[Unreadable],
         gathered: &mut Gathered,
     ) -> Option<Fault> {
         let only = self.plan.borrow().as_ref().is_none_or(|plan| plan.is_empty());
-        let retried = self.learned().retry(due, only);
+        let retried = self.learned().retry(Instant::now(), only);
         let mut fault = None;
         for &Unreadable { range, fault: mut found, .. } in known {
             if retried == Some(range) {
@@ -568,8 +567,7 @@ impl Device {
                 self.take(block, bytes, gathered);
                 Ok(())
             }
-            // A single field that may be readable again is asked for in every poll.
-            Err(fault) if fault.is_illegal() && (block.fields.len() > 1 || !fault.may_pass()) => {
+            Err(fault) if fault.is_illegal() => {
                 gathered.answered = true;
                 self.search(gathered, block, fault).await
             }

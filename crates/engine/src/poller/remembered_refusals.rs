@@ -63,8 +63,7 @@ impl Learned {
 
     /// The device refuses this block. Replaces what is known about an equal one.
     pub(super) fn refused(&mut self, block: &Block, fault: Fault) {
-        let pause = if fault.may_pass() { Duration::ZERO } else { RETRY_REFUSED_AFTER };
-        let (range, retry_at) = (block.range(), Instant::now() + pause);
+        let (range, retry_at) = (block.range(), Instant::now() + RETRY_REFUSED_AFTER);
         debug_assert!(range.count > 0);
         self.unreadable.retain(|known| known.range != range);
         self.unreadable.push(Unreadable { range, fault, retry_at });
