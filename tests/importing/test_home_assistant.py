@@ -1106,34 +1106,44 @@ def test_an_entity_ends_with_its_area(imported: Callable[..., Imported]) -> None
         imported("sensors: [{name: x, address: 65535, data_type: uint32}]")
 
 
-def test_a_name_that_is_a_topic_does_not_depend_on_the_other_entities(
-    imported: Callable[..., Imported],
+def test_no_entity_gets_the_name_of_one_that_was_removed(
+    imported: Callable[..., Imported], tmp_path: Path
 ) -> None:
+    (tmp_path / "secrets.yaml").write_text("id: hunter2\n")
     switches = [
         "{name: Насос, address: 5, slave: 1, write_type: coil, verify: }",
         "{name: Котёл, address: 6, slave: 1, write_type: coil, verify: {address: 9}}",
-        "{name: Вентилятор, address: 7, slave: 1, write_type: coil, unique_id: fan}",
+        "{name: Coil 5, address: 4, slave: 1, write_type: coil}",
         "{name: Główny, address: 8, slave: 1, command_on: 1}",
         "{name: Główna, address: 8, slave: 1, command_on: 2}",
+        "{name: Główne, address: 8, slave: 1, command_on: 3}",
         "{name: Außen, address: 9, slave: 1}",
-        "{name: Pump, address: 10, slave: 1, unique_id: pump}",
-        "{name: pump, address: 11, slave: 1, unique_id: pump}",
+        "{name: Pump, address: 10, slave: 1, unique_id: valve}",
+        "{name: pump, address: 11, slave: 1, unique_id: !secret id}",
+        "{name: Valve, address: 12, slave: 1}",
     ]
-    found = imported(f"switches: [{', '.join(switches)}]")
-    names = ["coil_5", "coil_6", "coil_9_state", "fan"]
-    names += ["holding_register_8_a94c9379", "holding_register_8_ba200b2f", "aussen"]
-    assert list(tags(found)) == [*names, "holding_register_10", "holding_register_11"]
-    assert tags(found)["coil_6"]["description"] == "Котёл"
+    sensors = "sensors: [{name: Pump, address: 10, slave: 1}]"
+
+    def found_with(entities: list[str]) -> Imported:
+        return imported(f"switches: [{', '.join(entities)}]\n    {sensors}")
+
+    found = found_with(switches)
+    names = ["holding_register-10-sensor", "coil-5-switch", "coil-6-switch", "coil-9-switch_state"]
+    names += ["coil_5", *(f"holding_register-8-switch-{number}-of-3" for number in (1, 2, 3))]
+    names += ["aussen", "holding_register-10-switch", "holding_register-11-switch", "valve"]
+    assert list(tags(found)) == names
+    assert tags(found)["coil-6-switch"]["description"] == "Котёл"
     key = "8: modbus[0].switches"
-    assert [note for note in notes(found) if "renamed" in note][5:] == [
-        f"{key}[4].name: changed: renamed to {names[5]}: a name has letters from a to z, digits "
+    assert [note for note in notes(found) if "renamed" in note][-4:-1] == [
+        f"{key}[5].name: changed: renamed to {names[7]}: a name has letters from a to z, digits "
         "and '_'",
-        f"{key}[6].name: changed: renamed to holding_register_10: another entity has its name",
-        f"{key}[7].name: changed: renamed to holding_register_11: another entity has its name",
+        f"{key}[7].name: changed: renamed to {names[9]}: another entity has its name",
+        f"{key}[8].name: changed: renamed to {names[10]}: another entity has its name",
     ]
+    assert not [note for note in notes(found) if "hunter2" in note]
     for gone in range(len(switches)):
         rest = [each for index, each in enumerate(switches) if index != gone]
-        for name, tag in tags(imported(f"switches: [{', '.join(rest)}]")).items():
+        for name, tag in tags(found_with(rest)).items():
             assert tags(found).get(name, tag) == tag
 
 

@@ -8,11 +8,10 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
-from zlib import crc32
 
 from holdfast.config.text.messages import show
 from holdfast.importing.key_reader import Section
-from holdfast.importing.names import MAX_LENGTH, free_name
+from holdfast.importing.names import MAX_LENGTH
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
 from holdfast.values import encode, register_count
 from holdfast.values.digits import FLOATS
@@ -71,9 +70,9 @@ class Wanted:
     """A tag whose name is chosen when all tags of its unit are known."""
 
     name: str
-    """As an entity id; empty if that can't spell it."""
-    instead: list[str]
-    """Names for a tag whose own is empty, or that of another one, too: none depends on others."""
+    """As an entity id, so without a hyphen; empty if that can't spell it."""
+    place: str
+    """Area, address and platform with hyphens: the name if its own is empty, or another one's."""
     tag: dict[str, Any]
     description: str
     at: KeyPath
@@ -89,16 +88,16 @@ class Places:
     at: KeyPath = ()
     """The place of the entity that is being read."""
     name: str = ""
-    unique_id: object = None
+    platform: str = ""
     interval: int = 0
     """All three of that entity."""
     written: dict[bool, list[KeyPath]] = field(default_factory=lambda: {False: [], True: []})
     """What writes one coil or register, with functions 5 and 6, or (`True`) with 15 and 16."""
 
-    def begin(self, entity: Section, interval: int) -> None:
+    def begin(self, entity: Section, platform: str, interval: int) -> None:
         """The tags that are added from now on are those of this entity."""
         self.at, self.name, self.interval = entity.path, _name(entity), interval
-        self.unique_id = entity.data.get("unique_id")
+        self.platform = platform.removesuffix("es" if platform == "switches" else "s")
 
     def add(self, name: str, area: Area, address: int, **settings: Any) -> None:
         """Adds a tag; its name is that of an entity id, and `name` its description."""
@@ -107,24 +106,27 @@ class Places:
         if address + size > ADDRESSES:
             message = f"{name} is at {address} to {address + size - 1}"
             self.desk.problem(self.at, f"{message}, allowed: up to {LAST_ADDRESS}")
-        part = name.removeprefix(self.name)
-        place = _spelt(f"{area.removesuffix('s')} {address}{part}")
-        instead = [place, f"{place[: MAX_LENGTH - 9]}_{crc32(name.encode()):08x}"]
-        if self.unique_id is not None and (spelt := _spelt(f"{self.unique_id}{part}")):
-            instead.insert(0, spelt)
-        self.tags.append(Wanted(_spelt(name), instead, tag, name, self.at, self.interval))
+        part = _spelt(f"{self.platform}{name.removeprefix(self.name)}")
+        place = f"{area.removesuffix('s')}-{address}-{part}"[: MAX_LENGTH - len("-9999-of-9999")]
+        self.tags.append(Wanted(_spelt(name), place, tag, name, self.at, self.interval))
 
     def named(self) -> dict[str, Wanted]:
-        """The tags by name, whatever the order of their entities: a name is a topic to write to."""
-        wanted = Counter(each.name for each in self.tags if each.name)
-        others = [each for each in self.tags if wanted[each.name] != 1]
-        instead = Counter(name for each in others for name in each.instead)
+        """The tags by name.
+
+        A name is a topic to write to: when an entity is removed, none may get its name. So equal
+        places have their number in theirs, too.
+        """
+        own = Counter(each.name for each in self.tags if each.name)
+        places = Counter(each.place for each in self.tags if own[each.name] != 1)
+        numbers = Counter[str]()
         tags: dict[str, Wanted] = {}
         for each in self.tags:
             name = each.name
-            if wanted[name] != 1:
-                free = (name for name in each.instead if instead[name] == 1 and not wanted[name])
-                name = next(free, None) or free_name(each.instead[-1], {*wanted, *tags})
+            if own[name] != 1:
+                name = each.place
+                if places[name] > 1:
+                    numbers[name] += 1
+                    name = f"{name}-{numbers[name]}-of-{places[name]}"
                 reason = "another entity has its name" if each.name else _NAME_FORM
                 self.desk.changed((*each.at, "name"), f"renamed to {name}: {reason}")
             if name != each.description:

@@ -248,7 +248,7 @@ class _Hub:
         self.timeout = self._timeout()
         for platform, convert in PLATFORMS.items():
             for entity in self._entities(platform):
-                self._entity(entity, convert)
+                self._entity(entity, platform, convert)
         self._choose_functions()
         hub.close(_HUB_REASONS)
 
@@ -286,7 +286,7 @@ class _Hub:
             return [Section(self.desk, self.hub.at(platform), found)]
         return self.hub.sections(platform)
 
-    def _entity(self, entity: Section, convert: Entities) -> None:
+    def _entity(self, entity: Section, platform: str, convert: Entities) -> None:
         given = entity.get("device_address")
         key = "device_address" if given is not None else "slave"
         least, most = (1, MAX_SERIAL_UNIT) if self._is_line else (0, MAX_UNIT)
@@ -298,7 +298,7 @@ class _Hub:
         interval = entity.integer("scan_interval", 0, 86_400, what="seconds")
         known = len(places.tags)
         if entity.text("name", required=True) is not None:
-            places.begin(entity, SCAN_INTERVAL_S if interval is None else interval)
+            places.begin(entity, platform, SCAN_INTERVAL_S if interval is None else interval)
             convert(places, entity)
         if interval == 0 and len(places.tags) > known:
             entity.changed("scan_interval", "polled with the others of its device")
