@@ -1245,6 +1245,46 @@ def test_actions_that_write_are_noted_with_what_replaces_them(
     ]
 
 
+@pytest.mark.parametrize(
+    ("entities", "instead"),
+    [
+        ("numbers: [{name: level, slave: 1, address: 5}]", "publish the value to"),
+        (
+            "numbers: [{name: level, slave: 1, address: 5, scan_interval: 60}]",
+            "publish the value to",
+        ),
+        (
+            "climates: [{name: room, slave: 1, address: 5, target_temp_register: 7}]",
+            "set writable: true for room of inverter, and publish the value to",
+        ),
+        (
+            "numbers: [{name: level, slave: 1, address: 5}]\n"
+            "  - {name: inverter, type: tcp, host: x, port: 502, "
+            "sensors: {name: power, slave: 1, address: 9}}",
+            "publish the value to",
+        ),
+    ],
+)
+def test_the_tag_that_replaces_an_action_is_writable_or_of_one_register(
+    imported: Callable[..., Imported], entities: str, instead: str
+) -> None:
+    found = imported(
+        "sensors: [{name: energy, slave: 1, address: 5, data_type: uint32}]\n"
+        f"    {entities}\n"
+        "script: {x: {sequence: [{action: modbus.write_register, "
+        "data: {hub: inverter, slave: 1, address: 5, value: 1}}]}}\n",
+        HUB.replace("automation: !include automations.yaml\n", ""),
+    )
+    [note] = [each for each in notes(found) if "stops when modbus is removed: " in each]
+    [place] = [
+        f"{device}/{name}"
+        for device, settings in found.data["devices"].items()
+        for name, tag in settings["tags"].items()
+        if tag["address"] == 5 and name != "energy"
+    ]
+    assert note.endswith(f"removed: {instead} plant/{place}/set")
+
+
 def test_actions_in_other_files_and_entities_without_a_unit_are_to_be_checked(
     imported: Callable[..., Imported],
 ) -> None:

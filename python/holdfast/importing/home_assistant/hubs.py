@@ -164,7 +164,7 @@ def _devices(desk: Desk, hubs: list[Section]) -> dict[str, dict[str, Any]]:
         units = {number: places for number, places in read.units.items() if places.tags}
         for number, places in units.items():
             of_unit = name if len(units) == 1 else f"{name}-{number}"
-            its_names = of_units[source_name, number] = []
+            its_names: list[str] = []
             for interval, tags in _by_interval(places).items():
                 wished = f"{of_unit}-{interval}s" if its_names else of_unit
                 its_name = name if wished == name else free_name(wished[-MAX_LENGTH:], taken)
@@ -182,6 +182,7 @@ def _devices(desk: Desk, hubs: list[Section]) -> dict[str, dict[str, Any]]:
                     "max_gap": 0,
                     "tags": {key: each.tag for key, each in tags.items()},
                 }
+            of_units.setdefault((source_name, number), []).extend(its_names)
     if devices:
         _to_check(desk, hubs[0].path)
         note_write_actions(desk, hubs[0].path, of_units, devices)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.text.messages import show
 from holdfast.config.values.mqtt_output_topics import TopicNames
 from holdfast.runtime.text import all_of, either
+from holdfast.values import register_count
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -44,12 +45,15 @@ def note_write_actions(
         address = data.get("address")
         names = of_units.get((str(hub), _whole(unit)), [])
         place = (_WRITES[action], _whole(address))
+        tags = [
+            (name, key, tag)
+            for name in names
+            for key, tag in devices[name]["tags"].items()
+            if (tag["area"], tag["address"]) == place and tag.get("type") != "bit:0"
+        ]
         instead = "make a tag writable, and publish to its set topic"
-        tags = [(name, *item) for name in names for item in devices[name]["tags"].items()]
-        for name, key, tag in tags:
-            if (tag["area"], tag["address"]) == place and tag.get("type") != "bit:0":
-                instead = _instead(name, key, tag)
-                break
+        if tags:
+            instead = _instead(*min(tags, key=_preference))
         target = f"address {show(address)} of unit {show(unit)} of hub {show(hub)}"
         message = f"{action} to {target} stops when modbus is removed: {instead}"
         file = desk.document.place(path, of_key=True).file
@@ -78,6 +82,12 @@ def _whole(value: Any) -> int:
         return int(float(value))
     except (TypeError, ValueError, OverflowError):
         return -1
+
+
+def _preference(candidate: tuple[str, str, dict[str, Any]]) -> tuple[bool, int]:
+    """Least for a tag that is writable already, then for one of one register, as was written."""
+    _, _, tag = candidate
+    return not tag.get("writable"), register_count(tag.get("type", "uint16"))
 
 
 def _instead(device: str, name: str, tag: dict[str, Any]) -> str:
