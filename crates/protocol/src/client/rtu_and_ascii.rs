@@ -389,8 +389,9 @@ impl OneAtATime {
             }
             let start = [unit_id, function];
             let len = response_len(if bytes.len() > 1 { bytes } else { &start }, request).ok()?;
-            let usual = read_bytes(request).map_or(rtu::MAX_LEN, |count| count + 5);
-            self.may_come(pads, request, bytes, len).then(|| len.unwrap_or(usual) - 3)
+            let most = read_reply_len(request).unwrap_or(rtu::MAX_LEN);
+            // Without unit id and CRC.
+            self.may_come(pads, request, bytes, len).then(|| len.unwrap_or(most) - 3)
         };
         let missing = |at, pdu_len| {
             let received = self.received.len() - at;
@@ -847,7 +848,7 @@ impl OneAtATime {
         pads || code & 0x80 != 0
             || asked.any(|request| {
                 let is_of_function = request.pdu().first() == Some(code);
-                is_of_function && read_bytes(request).is_none_or(|count| len == count + 5)
+                is_of_function && read_reply_len(request).is_none_or(|expected| len == expected)
             })
     }
 
@@ -891,6 +892,12 @@ fn response_len(bytes: &[u8], request: &EncodedRequest) -> Result<Option<usize>,
         return Ok(rtu::decode(bytes).is_ok().then_some(bytes.len()));
     }
     rtu::response_len(bytes, pdu.len())
+}
+
+/// The length of the RTU frame that answers a read: unit id, function, byte count, the values and CRC; `None` for
+/// any other request.
+fn read_reply_len(request: &EncodedRequest) -> Option<usize> {
+    read_bytes(request).map(|count| count + 5)
 }
 
 /// Whether an RTU reply to this request may begin with these bytes.

@@ -68,7 +68,9 @@ LIST = (TEXT, FORMAT, PROFILE)
 
 _SHORT, _LONG = OwnThread("holdfast-short-tag-lists"), OwnThread("holdfast-long-tag-lists")
 _KNOWN: WeakValueDictionary[tuple[str, bool], TagList] = WeakValueDictionary()
-"""The parsed lists: requests with one of them wait for no thread."""
+"""The lists in the cache of `_parsed`, which can't be looked into without a call. Requests with one
+of them wait for no thread.
+"""
 
 
 async def tags_of(given: Given, profiles: Mapping[str, TagList]) -> TagList:
