@@ -8,14 +8,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
 from holdfast._core import Request
-from holdfast.client import requests
+from holdfast.client import identification, requests
 from holdfast.client.base import BaseClient
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Sequence
 
     from holdfast.client.async_transports import AsyncTransport
-    from holdfast.client.requests import EventLog, Identification, Plan, Result, ServerId
+    from holdfast.client.identification import Identification
+    from holdfast.client.requests import EventLog, Plan, Result, ServerId
     from holdfast.types import (
         Area,
         BoolType,
@@ -201,7 +202,7 @@ class AsyncOperations(BaseClient):
 
     async def identify(self, *, unit: int | None = None) -> Identification:
         """Reads all identification objects of the device (function 43/14)."""
-        return await self._run(requests.identify(), unit)
+        return await self._run(identification.identify(), unit)
 
     async def report_server_id(self, *, unit: int | None = None) -> ServerId:
         """Reads the server id of the device (function 17)."""

@@ -8,14 +8,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
 from holdfast._core import Request
-from holdfast.client import requests
+from holdfast.client import identification, requests
 from holdfast.client.base import BaseClient
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from holdfast._core import BlockingClient
-    from holdfast.client.requests import EventLog, Identification, Plan, Result, ServerId
+    from holdfast.client.identification import Identification
+    from holdfast.client.requests import EventLog, Plan, Result, ServerId
     from holdfast.types import (
         Area,
         BoolType,
@@ -197,7 +198,7 @@ class SyncOperations(BaseClient):
 
     def identify(self, *, unit: int | None = None) -> Identification:
         """Reads all identification objects of the device (function 43/14)."""
-        return self._run(requests.identify(), unit)
+        return self._run(identification.identify(), unit)
 
     def report_server_id(self, *, unit: int | None = None) -> ServerId:
         """Reads the server id of the device (function 17)."""

@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable, Iterator, Sequence
 
     from holdfast.client import SyncClient
-    from holdfast.client.requests import Identification, ServerId
+    from holdfast.client.identification import Identification
+    from holdfast.client.requests import ServerId
     from holdfast.net.addresses import Address, Network
 
 UNUSUAL_UNIT = 231

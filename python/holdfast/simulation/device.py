@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import values
 from holdfast._core import Memory, Rule
-from holdfast.simulation import generators
+from holdfast.simulation import usual_values
 from holdfast.simulation.capacity import Capacity, nearest
-from holdfast.simulation.scales import RowDoesNotFit, Scales
+from holdfast.simulation.scale_registers import RowDoesNotFit, Scales
 from holdfast.tags.scale import RegisterScale
 from holdfast.types import AREAS
 from holdfast.values import DoesNotFit
@@ -132,8 +132,8 @@ class SimulatedDevice:
         try:
             if played is not None:
                 self._scales.check_played(tag, played)
-                return generators.still(tag)  # Not used: what is played takes precedence.
-            found = of or generators.usual(self._with_scale(tag), *within)
+                return usual_values.still(tag)  # Not used: what is played takes precedence.
+            found = of or usual_values.usual(self._with_scale(tag), *within)
             if found.kind == "counter":
                 least_step = self._scales.least_step(tag)
                 self._scales.check(tag, [0, found.first_count(step, least_step)])
@@ -167,7 +167,7 @@ class SimulatedDevice:
                 tag.name,
                 f"{tag.name} keeps what is written to its registers, allowed: constant:VALUE",
             )
-        value = (generator or generators.still(tag)).items[0] if played is None else played[0]
+        value = (generator or usual_values.still(tag)).items[0] if played is None else played[0]
         if generator is not None or played is not None:
             try:
                 self._scales.check(tag, [value])
@@ -262,7 +262,7 @@ def _of_scales(tags: Sequence[Tag]) -> dict[str, Generator]:
             forms[tag.source.area, tag.source.address] = tag.scale.form
     places = {tag: (tag.area, tag.address) for tag in tags if tag.is_number}
     return {
-        tag.name: generators.scale(tag, forms[place])
+        tag.name: usual_values.scale(tag, forms[place])
         for tag, place in places.items()
         if place in forms and tag.source is None
     }

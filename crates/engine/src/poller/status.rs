@@ -68,6 +68,7 @@ impl StatusSettings {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Status {
     pub health: Health,
+    /// The code of a `Fault` of the link, 0 for none.
     pub last_error: u16,
     pub seconds_in_error: u16,
     pub polls: u32,

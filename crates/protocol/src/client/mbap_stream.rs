@@ -5,9 +5,10 @@ use alloc::collections::BTreeMap;
 use alloc::vec::Vec;
 use core::time::Duration;
 
+use super::consecutive_timeouts::ConsecutiveTimeouts;
 use super::flights::{Call, Done, Flight, Flights, Ticket};
 use super::raised_timeouts::{Lateness, MAX_RAISED_FACTOR};
-use super::{Closed, Failure, InvalidResponse, MAX_CONSECUTIVE_TIMEOUTS, Time};
+use super::{Closed, Failure, InvalidResponse, Time};
 use crate::frame::mbap::{self, Next};
 
 /// Bytes of an exception reply.
@@ -25,13 +26,7 @@ pub(super) struct Stream {
     pub(super) lateness: Lateness,
     /// The beginning of a frame.
     partial: Vec<u8>,
-    /// The number of timeouts since the last received byte, and the times of the first and the last one.
-    timeouts: u32,
-    silent_since: Time,
-    timed_out: Time,
-    /// The next deadline of a request whose caller has not waited for it, and when the request was sent.
-    /// `None` once a byte was received.
-    cut_short: Option<(Time, Time)>,
+    timeouts: ConsecutiveTimeouts,
     /// Bytes that the header of an exception reply counted beyond its end. They may come, or not.
     surplus: usize,
 }
@@ -104,18 +99,14 @@ impl Stream {
     }
 
     /// Gives a request up: its reply, should it come, is dropped. It still counts as a timeout at its
-    /// deadline: callers with less time than that must not stay on a dead connection. One that waits for
-    /// a pause is not sent.
+    /// deadline. One that waits for a pause is not sent.
     pub(super) fn cancel(&mut self, flights: &mut Flights, ticket: Ticket) {
         // While there is a pause, all requests are in `out`, in their order.
         let behind: usize = flights.after(ticket).map(frame_len).sum();
         let Some(flight) = flights.take(ticket) else { return };
         if flights.held.is_none() {
             self.given_up.insert(flight.transaction_id, GivenUp::new(&flight, false));
-            // Requests in flight at the same time count as one: the first deadline is enough.
-            let next = (flight.deadline, flight.sent);
-            self.cut_short = Some(self.cut_short.map_or(next, |first| first.min(next)));
-            return;
+            return self.timeouts.cut_short(flight.deadline, flight.sent);
         }
         let end = flights.out.len().saturating_sub(behind);
         flights.out.drain(end.saturating_sub(frame_len(&flight))..end);
@@ -131,7 +122,7 @@ impl Stream {
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
-        (self.timeouts, self.cut_short) = (0, None);
+        self.timeouts.clear();
         let mut partial = core::mem::take(&mut self.partial);
         let mut rest = if partial.is_empty() {
             bytes
@@ -254,36 +245,19 @@ impl Stream {
             timed_out = true;
             let given_up = GivenUp::new(&flight, flight.may_be_unread(now));
             self.given_up.insert(flight.transaction_id, given_up);
-            self.count_timeout(flight.sent, now);
+            self.timeouts.add(flight.sent, now);
             flights.end(flight, Err(Failure::Timeout), sink);
         }
-        if let Some((_, sent)) = self.cut_short.take_if(|(deadline, _)| *deadline <= now) {
-            timed_out = true;
-            self.count_timeout(sent, now);
-        }
+        timed_out |= self.timeouts.add_cut_short(now);
         if timed_out && self.has_broken_off(flights) {
             flights.close(Closed::BrokenOff, sink);
-        } else if self.timeouts >= MAX_CONSECUTIVE_TIMEOUTS
-            && flights.longest_timeout() <= now.saturating_sub(self.silent_since)
-        {
+        } else if self.timeouts.are_too_many(flights.longest_timeout(), now) {
             flights.close(Closed::Silent, sink);
         }
     }
 
-    /// Counts the timeout of a request, unless one before was already counted while it was in flight.
-    fn count_timeout(&mut self, sent: Time, now: Time) {
-        if self.timeouts == 0 {
-            self.silent_since = now;
-        } else if sent < self.timed_out {
-            return;
-        }
-        self.timeouts += 1;
-        self.timed_out = now;
-    }
-
     pub(super) fn deadline(&self, flights: &Flights) -> Option<Time> {
-        let cut_short = self.cut_short.map(|(deadline, _)| deadline);
-        flights.deadline().into_iter().chain(cut_short).min()
+        flights.deadline().into_iter().chain(self.timeouts.deadline()).min()
     }
 
     /// Whether another reply begins in the frame at the start of `bytes`, which was cut off: there is no check

@@ -29,6 +29,7 @@
 
 mod attempts;
 mod connection;
+mod consecutive_timeouts;
 mod echo;
 mod flights;
 mod late_replies_without_ids;
@@ -40,6 +41,7 @@ mod tolerance;
 
 pub use attempts::{Attempt, BUSY_PAUSE};
 pub use connection::{Connection, Past};
+pub use consecutive_timeouts::MAX_CONSECUTIVE_TIMEOUTS;
 pub use echo::Echo;
 pub use flights::{Done, Strays, Ticket};
 pub use late_replies_without_ids::{GUARD, MAX_LATENESS};
@@ -56,10 +58,6 @@ use crate::pdu::ResponseError;
 
 /// The clock of the driver: the time since any fixed moment. It never runs backwards.
 pub type Time = Duration;
-
-/// The number of consecutive timeouts, without a received byte, after which a connection ends.
-/// Requests in flight at the same time count as one.
-pub const MAX_CONSECUTIVE_TIMEOUTS: u32 = 3;
 
 /// How long after its timeout a reply may be read that came in time: the driver may have had no processor. One
 /// that is read later is a late reply, because its values are old.

@@ -13,13 +13,14 @@ from holdfast.cli.options import device
 from holdfast.cli.options.option import json_option
 from holdfast.cli.options.url import url_argument
 from holdfast.cli.terminal_text import print_json
-from holdfast.client.requests import OBJECT_NAMES
+from holdfast.client.identification import OBJECT_NAMES
 from holdfast.errors import ModbusError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from holdfast.client.requests import Identification, ServerId
+    from holdfast.client.identification import Identification
+    from holdfast.client.requests import ServerId
 
 Answer = TypeVar("Answer")
 

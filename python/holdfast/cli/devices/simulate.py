@@ -32,7 +32,7 @@ from holdfast.events.writer import announce
 from holdfast.net.addresses import LOOPBACK, joined, reachable
 from holdfast.runtime.suggestion import suggestion
 from holdfast.server import Server
-from holdfast.simulation import HEATER, generators, playback
+from holdfast.simulation import HEATER, generators, playback, usual_values
 from holdfast.simulation.device import Refused, SimulatedDevice
 from holdfast.simulation.faults import FaultProxy, Faults
 from holdfast.tags.text import text_of
@@ -247,7 +247,7 @@ def _known(file: Path, profile: str | None, tags: TagList, url: str, unit: int) 
     lines = [f"  {command}"]
     writable = next((tag for tag in tags if tag.writable and tag.is_number), None)
     if writable is not None:
-        value = text_of(writable, generators.still(writable).items[0])
+        value = text_of(writable, usual_values.still(writable).items[0])
         write = ["holdfast", "write", url, f"{writable.name}={value}", *options]
         lines.append(f"  {shell_command(*write)}")
     return lines

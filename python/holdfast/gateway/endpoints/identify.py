@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.client.requests import OBJECT_NAMES
+from holdfast.client.identification import OBJECT_NAMES
 from holdfast.gateway.endpoint import EXAMPLE, Endpoint
 from holdfast.net.http.schemas import TEXT_OR_NULL, integer, map_of
 
