@@ -10,7 +10,7 @@ import pytest
 
 from holdfast._core import Request
 from holdfast.client.url import NetworkTarget
-from holdfast.gateway.egress import Route
+from holdfast.gateway.device_routes import Route
 from holdfast.gateway.pool import Pool
 from support import gateways, wire
 from support.fake_device import HANG_UP, Stream, Udp, exception, registers, silent

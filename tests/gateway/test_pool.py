@@ -11,7 +11,7 @@ from holdfast._core import Request
 from holdfast.client.url import NetworkTarget
 from holdfast.errors import ConnectFailed, ConnectionLost, RequestTimeout
 from holdfast.gateway import pool
-from holdfast.gateway.egress import Route
+from holdfast.gateway.device_routes import Route
 from holdfast.gateway.pool import Pool
 from holdfast.gateway.shared_devices import Turns
 from holdfast.net.http.requests import BadRequest

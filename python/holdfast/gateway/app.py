@@ -19,7 +19,7 @@ from holdfast.events import log_lines
 from holdfast.gateway import assets, port_of_call
 from holdfast.gateway.broadcast import NOTE
 from holdfast.gateway.device import Failed, RequestedDevice
-from holdfast.gateway.egress import Egress
+from holdfast.gateway.device_routes import DeviceRoutes
 from holdfast.gateway.endpoints import address_map
 from holdfast.gateway.endpoints.request_tags import SHORT_SIZE
 from holdfast.gateway.pool import Pool
@@ -99,7 +99,7 @@ class App(Application):
         self._settings = settings
         # A lookup never needs more time than the longest request.
         resolve = resolve or Resolver(limits.timeout)
-        self._egress = Egress(AllowList(settings.allow), resolve, settings.tls)
+        self._routes = DeviceRoutes(AllowList(settings.allow), resolve, settings.tls)
         self._pool = Pool(
             most=limits.devices,
             in_flight=limits.in_flight,
@@ -254,7 +254,7 @@ class App(Application):
             is_write = endpoint.writes(given)
             if is_write and not self._settings.writes:
                 raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
-            device = RequestedDevice(self._egress, self._pool, given, broadcast=endpoint.broadcast)
+            device = RequestedDevice(self._routes, self._pool, given, broadcast=endpoint.broadcast)
             with self._request_to(device):
                 work = self._reply(request, endpoint, given, device, is_write)
                 try:
@@ -332,7 +332,7 @@ class App(Application):
         """Maps a device."""
         with self._stream(request):
             self._require_stream(request, given["maxStreams"])
-            device = RequestedDevice(self._egress, self._pool, given)
+            device = RequestedDevice(self._routes, self._pool, given)
             longest = self._limits.discovery
             await self._while_streaming(
                 request, lambda stream: address_map.survey(given, device, stream, longest)
@@ -346,13 +346,13 @@ class App(Application):
             detail = f"Host is a name, allowed without tokens for GET {watch.PATH}: an IP address"
             raise BadRequest("foreign_page", f"{detail}, localhost; or use POST {views.PATH}")
         with self._stream(request):
-            device = RequestedDevice(self._egress, self._pool, given)
+            device = RequestedDevice(self._routes, self._pool, given)
             await self._while_streaming(request, lambda stream: watch.watch(given, device, stream))
 
     async def view(self, request: Request, given: Given) -> None:
         """Follows several ranges and tag lists of a device."""
         parts = await self._parsed(request, views.parts_of, given)
-        device = RequestedDevice(self._egress, self._pool, given)
+        device = RequestedDevice(self._routes, self._pool, given)
         streaming = not given["once"] and self._has_stream(request, given["maxStreams"])
         with contextlib.ExitStack() as places:
             if streaming:

@@ -30,7 +30,7 @@ from holdfast.types import SERIAL_FRAMES
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
 
-    from holdfast.gateway.egress import Egress
+    from holdfast.gateway.device_routes import DeviceRoutes
     from holdfast.gateway.pool import Pool
     from holdfast.gateway.shared_devices import Turns
     from holdfast.types import Transport
@@ -65,7 +65,12 @@ class RequestedDevice:
     """The device of one request."""
 
     def __init__(
-        self, egress: Egress, pool: Pool, given: Mapping[str, Any], *, broadcast: bool = False
+        self,
+        routes: DeviceRoutes,
+        pool: Pool,
+        given: Mapping[str, Any],
+        *,
+        broadcast: bool = False,
     ) -> None:
         """`broadcast`: whether the request may be a broadcast. Raises `BadRequest`."""
         self.transport: Transport = given["transport"]
@@ -85,7 +90,7 @@ class RequestedDevice:
         """Whether the device may have received a request."""
         self._is_unsent = False
         """Whether the last call has sent nothing."""
-        self._egress = egress
+        self._routes = routes
         self._pool = pool
 
     @property
@@ -127,7 +132,7 @@ class RequestedDevice:
 
         try:
             async with asyncio.timeout(self.timeout):
-                route = await self._egress.route(self.transport, self.host, self.port, self._name)
+                route = await self._routes.route(self.transport, self.host, self.port, self._name)
                 return await self._pool.run(route, self.timeout, run)
         except NoSuchName as error:
             raise Failed("no_such_name", str(error)) from None

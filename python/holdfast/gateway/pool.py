@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from holdfast._core import Request
     from holdfast.client.async_transports import OwnTransport
-    from holdfast.gateway.egress import Route
+    from holdfast.gateway.device_routes import Route
     from holdfast.gateway.shared_devices import Shared
     from holdfast.net.tls import Tls
 

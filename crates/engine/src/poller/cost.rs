@@ -1,4 +1,5 @@
-//! Estimates the time per request and per register of a device, from measured round trips.
+//! Estimates the time per request and per register of a device, from measured round trips. `plan::by_cost` decides
+//! from them which gaps are read.
 
 /// The number of answers that an estimate requires.
 const MIN_SAMPLES: u32 = 100;

@@ -1,4 +1,5 @@
-//! Verifies the certificates of clients, for a server.
+//! Verifies the certificates of clients, for a server. [`Trust`] decides whether a listed certificate is trusted,
+//! and for which others it vouches.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;

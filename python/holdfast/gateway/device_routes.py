@@ -35,8 +35,8 @@ class Route:
     """The addresses that the gateway may connect to, which were checked."""
 
 
-class Egress:
-    """The egress list and the resolver."""
+class DeviceRoutes:
+    """Routes to the targets that the egress list allows."""
 
     def __init__(self, allowed: AllowList, resolve: Resolve, tls: Tls) -> None:
         self._allowed = allowed
