@@ -645,6 +645,17 @@ def test_tokens_are_hashed(imported: Import) -> None:
     assert noted(found, "rest.auth: check: as it ran: these tokens had no effect")
 
 
+def test_a_token_that_looks_octal_is_not_shown(imported: Import) -> None:
+    with pytest.raises(NotImportable) as raised:
+        imported(FIRST + REST % ("127.0.0.1:8080", "0123456701234567"))
+    messages = [each.message for each in raised.value.problems]
+    assert messages[0] == (
+        "found a number (hidden, as it may be a secret), which the source read as octal, allowed: "
+        "text in quotes"
+    )
+    assert "23456701234567" not in str(raised.value)
+
+
 def test_tokens_only_read_where_there_is_nothing_that_rest_could_write(imported: Import) -> None:
     found = imported(FIRST + REST % ("127.0.0.1:8080", "a-long-secret-token-of-a-gate"))
     (token,) = found.data["rest"]["tokens"]

@@ -145,7 +145,8 @@ class Source:
                 self._refuse_other_bases((*path, key), each)
         elif type(value) is int or (self._has_underscores and isinstance(value, str)):
             place = self.desk.document.place(path)
-            found = _OTHER_BASE.match(self._line(place.file, place.line), place.column - 1)
+            line = self._line(place.file, place.line)
+            found = _OTHER_BASE.match(line, place.column - 1)
             if found is None:
                 return
             # With underscores, it is text here, and numbers are also read from text.
@@ -153,10 +154,14 @@ class Source:
                 return
             digits = found[1].replace("_", "")
             base, name = (2, "binary") if "b" in digits else (8, "octal")
-            if (number := int(digits, base)) != value:
-                message = f"found {found[1]}, which the source read as {name}, allowed: {number}"
-                meant = f", or {value} if that is meant" if type(value) is int else ""
-                self.desk.problem(path, f"{message}{meant}")
+            if (number := int(digits, base)) == value:
+                return
+            meant = f", or {value} if that is meant" if type(value) is int else ""
+            shown, allowed = found[1], f"{number}{meant}"
+            if _SECRET.search(line):
+                shown, allowed = "a number (hidden, as it may be a secret)", "text in quotes"
+            message = f"found {shown}, which the source read as {name}, allowed: {allowed}"
+            self.desk.problem(path, message)
 
     def _without_secrets(self, problems: Iterable[Problem]) -> list[Problem]:
         """Hides what a YAML error quotes from a line that may contain a secret."""
