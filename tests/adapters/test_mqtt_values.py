@@ -116,6 +116,19 @@ def test_a_bad_payload_is_refused_counted_and_logged(
     assert rig.registers(4, 1) == [5]
 
 
+@pytest.mark.parametrize("kind", ["string:2", "bytes:2", "uint16"])
+def test_an_empty_payload_leaves_the_value(
+    rig: Rig, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig.memory.write("holding_registers", 4, [0x6162])
+    running, probe = started(rig, REGISTER | {"type": kind})
+    probe.publish(TOPIC, b"")
+    running.wait_until_received(1)
+    [fields] = refusals(caplog)
+    assert (fields["reason"], fields["cause"]) == ("invalid_value", "the payload is empty")
+    assert rig.registers(4, 1) == [0x6162]
+
+
 REFUSED: list[tuple[dict[str, Any], str, str, float | None]] = [
     (
         {"scale": 0.1, "round": "exact"},

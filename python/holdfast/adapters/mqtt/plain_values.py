@@ -43,6 +43,8 @@ class PlainValue:
     def command(self, payload: memoryview) -> dict[str, Any]:
         """The command that writes a payload. Raises `BadValue`."""
         try:
+            if not payload:  # Also removes a retained value, which is no reason to clear a text.
+                raise ValueError("the payload is empty")
             if len(payload) > MAX_VALUE_BYTES:
                 raise ValueError(f"{len(payload)} bytes, allowed: {MAX_VALUE_BYTES}")
             text = bytes(payload).decode()
