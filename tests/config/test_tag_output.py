@@ -32,6 +32,7 @@ TAGS = [
     Tag("power", "holding_registers", 61, scale=RegisterScale("exponent", "sf")),
     Tag("share", "holding_registers", 62, order="CDAB", scale=RATIO),
     Tag("setpoint", "holding_registers", 30, "int16", offset=-5, unit="°C", writable=True),
+    Tag("serial", "holding_registers", 34, "uint64", "CDAB", offset=2**53 + 1, max=2**63 + 1),
 ]
 STATE = Tag("state", "holding_registers", 31, states={0: "off", 1: "running"})
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 from typing import TYPE_CHECKING
 
 import pytest
@@ -228,6 +229,24 @@ def test_profiles_can_be_files(tmp_path: Path) -> None:
     t = Tag("t", "holding_registers", 3, "int16", scale=0.1, writable=True, null=null, unit="°C")
     assert list(config.tags("b")) == [t, Tag("on", "coils", 4, unit="a; b")]
     assert config.profile_files == (tmp_path / "pump.yaml", tmp_path / "fan.CSV")
+
+
+@pytest.mark.parametrize("number", [2**53 + 1, 2**63, 10**23, 1e23, 2.0**63, -(2**63), 3, 0.5])
+@pytest.mark.parametrize("key", ["scale", "offset", "min", "max", "deadband"])
+def test_numbers_keep_their_digits(tmp_path: Path, key: str, number: float) -> None:
+    number = abs(number) if key == "deadband" else number
+    yaml = f"tags: {{x: {{area: holding_registers, address: 0, type: uint64, {key}: {number}}}}}"
+    written(tmp_path, yaml, "y.yaml")
+    written(tmp_path, f"name,area,address,type,{key}\nx,hr,0,uint64,{number}\n", "c.csv")
+    devices = (f"{name}: {{url: tcp://{name}, profile: {name}, interval: 1}}" for name in "yc")
+    text = f"profiles: [y.yaml, c.csv]\ndevices: {{{', '.join(devices)}}}\n"
+    config = load(written(tmp_path, text))
+    again = load(written(tmp_path, config.dump()))
+    for device, of in (("y", config), ("c", config), ("y", again), ("c", again)):
+        [tag] = of.tags(device)
+        found = getattr(tag, key)
+        # A float stands for its shortest decimal, as in the calculations of a tag.
+        assert Fraction(repr(found)) == Fraction(repr(number)), device
 
 
 def test_the_columns_of_csv_have_an_order(tmp_path: Path) -> None:

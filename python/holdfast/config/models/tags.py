@@ -14,7 +14,7 @@ from pydantic.json_schema import WithJsonSchema
 from holdfast.config.models.base import INVALID, InvalidValue, Model
 from holdfast.config.models.memories import Register
 from holdfast.config.text.messages import show
-from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, whole_number
+from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, Number
 from holdfast.config.values.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
 from holdfast.tags import Tag, TagList
 from holdfast.tags.rounding import Rounding
@@ -27,7 +27,6 @@ def _written(marker: bool | int | float | str) -> bool | int | float | str:
     return str(marker) if isinstance(marker, float) and not isfinite(marker) else marker
 
 
-Number = Annotated[float, Field(allow_inf_nan=False), whole_number]
 Marker = Annotated[bool | int | float | str, AfterValidator(_written)]
 Scale = Annotated[
     float | ScaleConfig,

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeGuard
 from urllib.parse import unquote
@@ -23,6 +24,8 @@ from pydantic import (
     PlainValidator,
     Strict,
     ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
 )
 from pydantic.config import JsonDict
 from pydantic.json_schema import JsonSchemaValue
@@ -282,8 +285,21 @@ def _not_null(value: object) -> object:
     return value
 
 
-def _whole(value: float) -> int | float:
-    return int(value) if value.is_integer() else value
+def whole(value: int | float) -> int | float:
+    """A float without a fraction as the integer that its digits are."""
+    is_whole = isinstance(value, float) and value.is_integer()
+    return int(Decimal(repr(value))) if is_whole else value
+
+
+def exact_number(value: int | float) -> int | float:
+    """A float; an integer stays one if no float has its digits, as beyond 2^53."""
+    number = float(value)
+    return number if whole(number) == value else value
+
+
+def _exact(value: object, check: ValidatorFunctionWrapHandler) -> int | float:
+    number: float = check(value)
+    return exact_number(value) if type(value) is int else number
 
 
 class NotNull:
@@ -420,8 +436,9 @@ QualityOfService = Annotated[Literal[0, 1, 2], BeforeValidator(integral)]
 StopBits = Annotated[Literal[1, 2], BeforeValidator(integral)]
 DataBits = Annotated[Literal[7, 8], BeforeValidator(integral)]
 Connections = Annotated[int, Field(ge=1, le=MAX_CONNECTIONS)]
-whole_number = PlainSerializer(_whole, return_type=int | float)
+whole_number = PlainSerializer(whole, return_type=int | float)
 """Writes `1.0` as `1`."""
+Number = Annotated[float, Field(allow_inf_nan=False), WrapValidator(_exact), whole_number]
 SECONDS: JsonDict = {"$comment": "seconds"}
 MILLISECONDS: JsonDict = {"$comment": "milliseconds"}
 """JSON Schema keys for the units of times, which messages name."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, get_args
 
 from holdfast.config.text.messages import show
-from holdfast.config.values.scalars import is_name
+from holdfast.config.values.scalars import exact_number, is_name, whole
 from holdfast.protocol import LAST_ADDRESS
 from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import either, listing
@@ -72,7 +72,7 @@ def parse_scale(value: object) -> float | ScaleConfig:
         and not isinstance(value, bool)
         and -MAX_NUMBER <= value <= MAX_NUMBER
     ):
-        return float(value)
+        return exact_number(value)
     if not isinstance(value, dict):
         words = "a number, or a mapping with the keys from, as"
         raise ValueError(f"found {show(value)}, allowed: {words}")
@@ -118,7 +118,7 @@ def _keys(value: dict[Any, Any], known: Sequence[str], needed: Sequence[str], wh
 def written_scale(scale: float | ScaleConfig) -> int | float | dict[str, Any]:
     """The scale as in a file."""
     if not isinstance(scale, ScaleConfig):
-        return int(scale) if scale.is_integer() else scale
+        return whole(scale)
     place = scale.source
     source = place if isinstance(place, str) else dict(zip(PLACE_KEYS, place, strict=True))
     return {"from": source, "as": scale.form}
