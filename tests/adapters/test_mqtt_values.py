@@ -57,6 +57,8 @@ WRITTEN: list[tuple[dict[str, Any], str, list[int]]] = [
     (REGISTER | {"type": "uint16", "round": "nearest"}, "2.5", [2]),
     (REGISTER | {"type": "uint16[2]", "scale": 0.5}, "[0.74, 1]", [1, 2]),
     (REGISTER | {"type": "float32"}, "21.5", list(struct.unpack(">HH", struct.pack(">f", 21.5)))),
+    (REGISTER | {"type": "float32"}, "1e-400", [0, 0]),
+    (REGISTER | {"type": "float32[2]"}, "[1e-400, 1e-46]", [0, 0, 0, 0]),
     (REGISTER | {"type": "uint32", "order": "CDAB"}, "65538", [2, 1]),
     (REGISTER | {"type": "uint16", "states": {0: "off", 3: "fault"}}, "fault", [3]),
     (REGISTER | {"type": "string:2"}, "ab", [0x6162, 0]),

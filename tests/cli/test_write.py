@@ -153,6 +153,10 @@ def test_many_values_are_written_by_several_requests_if_that_is_wanted(
         (("hr", "0", "1e99", "--type", "float32"), "of float32."),
         (("hr", "0", "1e999", "--type", "float64"), "'1e999' is outside the range of float64."),
         (("hr", "0", "-1e999", "--type", "float16"), "'-1e999' is outside the range of float16."),
+        (
+            ("hr", "0", "1e-400", "--type", "float64"),
+            "is too small for float64, which would hold 0.",
+        ),
         (("hr", "0", "xy", "--type", "bytes:1"), "'xy' is not hex, allowed: pairs of hex digits."),
         (("hr", "0", "ABC", "--type", "string:2"), "allowed in string:2: up to 2."),
         (("hr", "0", "1", "--type", "int16[2]"), "int16[2] takes 2 values, found 1."),

@@ -359,6 +359,17 @@ def test_the_largest_floats_and_a_negative_zero_are_played_back(tmp_path: Path) 
         assert device.memory.read("input_registers", 0, 8) == registers
 
 
+@pytest.mark.parametrize("cell", ["1e-46", "1e-400"])
+def test_a_value_too_small_for_its_registers_is_played_back_as_zero(
+    tmp_path: Path, cell: str
+) -> None:
+    tags = TagList([Tag("f32", "input_registers", 0, "float32")])
+    file = tmp_path / "values.csv"
+    file.write_text(f"f32\n{cell}\n")
+    device = SimulatedDevice(tags, played=playback.load(file, tags).values)
+    assert device.memory.read("input_registers", 0, 2) == [0, 0]
+
+
 def test_a_state_is_played_back_by_its_name(tmp_path: Path) -> None:
     tags = TagList(
         [

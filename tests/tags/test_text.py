@@ -191,6 +191,9 @@ def test_text_is_parsed_by_the_type_of_the_tag(it: Tag, text: str, value: Any) -
         ),
         (tag("uint64", scale=0.001), "18446744073709551.616", "has too many digits"),
         (tag("int64", scale=0.1), "900719925474099.37", "has too many digits"),
+        (tag("float64"), "1e-400", "'1e-400' is too small for float64, which would hold 0"),
+        (tag("int16", scale=0.1), "-1e-400", "'-1e-400' is too small for int16"),
+        (tag("float32[2]"), "[1, 1e-400]", "'1e-400' is too small"),
         (tag("uint16[2]"), "1 2", "JSON array"),
         (tag("bytes:3"), "zz!", "base64"),
     ],
@@ -199,6 +202,24 @@ def test_text_is_parsed_by_the_type_of_the_tag(it: Tag, text: str, value: Any) -
 def test_text_that_is_no_value_is_refused(it: Tag, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         value_from(it, text)
+
+
+@pytest.mark.parametrize(
+    ("it", "text", "value"),
+    [
+        (tag("float64"), "-1e-400", -0.0),
+        (tag("int16", scale=0.1), "1e-400", 0.0),
+        (tag("float32[2]"), "[1, 1e-400]", [1, 0.0]),
+    ],
+    ids=repr,
+)
+def test_a_measurement_may_become_zero(it: Tag, text: str, value: Any) -> None:
+    assert repr(value_from(it, text, is_measurement=True)) == repr(value)
+
+
+def test_a_measured_integer_has_an_exponent_that_a_decimal_has() -> None:
+    with pytest.raises(ValueError, match="allowed: a JSON array"):
+        value_from(tag("int16[1]"), "[1e-99999999999999999999]", is_measurement=True)
 
 
 def test_a_scale_without_decimal_places_gives_none() -> None:

@@ -1,8 +1,12 @@
-"""Values and lists in messages. Values come from outside: they can have any size and character."""
+"""Values and lists in messages, and numbers in text.
+
+Values come from outside: they can have any size and character.
+"""
 
 from __future__ import annotations
 
 import os
+import re
 import sys
 from typing import TYPE_CHECKING
 
@@ -14,6 +18,11 @@ MAX_CHARACTERS = 40
 
 _FIRST_OF_WINSOCK = 10_000
 """Errors of sockets on Windows, which `os.strerror` does not know, have no lower number."""
+
+
+def would_be_zero(text: str) -> bool:
+    """Whether a decimal other than 0 is so small that its float is 0."""
+    return float(text) == 0 and re.search("[1-9]", re.split("[eE]", text)[0]) is not None
 
 
 def clip(text: str, most: int = MAX_CHARACTERS) -> str:

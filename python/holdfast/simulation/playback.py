@@ -113,7 +113,7 @@ def _value(tag: Tag, cell: str) -> Any:
         if tag.is_float and tag.of_type.count is None and cell in _INFINITIES:
             return float(cell)
         if tag.is_number:
-            return value_from(tag, cell, states=False)
+            return value_from(tag, cell, states=False, is_measurement=True)
         return from_text(cell, tag.of_type, tag.type)
     except ValueError:
         return value_from(tag, cell)

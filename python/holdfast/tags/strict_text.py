@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.runtime.malformed_json import MALFORMED_JSON
-from holdfast.runtime.text import quote
+from holdfast.runtime.text import quote, would_be_zero
 from holdfast.values import DoesNotFit
 
 if TYPE_CHECKING:
@@ -30,13 +30,14 @@ _LONG = ("int64", "uint64")
 _NUMBER = re.compile(r"[+-]?([0-9]{1,400}(\.[0-9]{0,400})?|\.[0-9]{1,400})([eE][+-]?[0-9]{1,3})?")
 
 
-def from_text(text: str, type: Type, named: str) -> Any:
+def from_text(text: str, type: Type, named: str, *, is_measurement: bool = False) -> Any:
     """Parses a text to a value of a type, which may still be outside its range.
 
-    Raises `ValueError`. `named` is the type as messages call it.
+    Raises `ValueError`. `named` is the type as messages call it. The numbers in a measured array
+    may become 0.
     """
     if type.count is not None:
-        return _array(text, type, named)
+        return _array(text, type, named, is_measurement)
     if type.base == "string":
         return text
     if type.base == "bytes":
@@ -61,6 +62,8 @@ def _number(text: str, named: str, is_float: bool) -> int | float:
         number = float(text)
         if math.isinf(number):
             raise ValueError(f"{quote(text)} does not fit {named}")
+        if would_be_zero(text):
+            raise ValueError(f"{quote(text)} is too small for {named}, which would hold 0")
         return number
     exact = Decimal(text)
     if exact.adjusted() > 20 or exact != exact.to_integral_value():
@@ -68,14 +71,17 @@ def _number(text: str, named: str, is_float: bool) -> int | float:
     return int(exact)
 
 
-def decimal_from(text: str, type: Type) -> int | float:
+def decimal_from(text: str, type: Type, is_measurement: bool = False) -> int | float:
     """Parses a number with a point or an exponent: for integers to one, if it is whole.
 
-    Raises `DoesNotFit`, also for more digits than a float has where a 64-bit integer needs them.
+    Raises `DoesNotFit`, also for more digits than a float has where a 64-bit integer needs them,
+    and for a number that would become 0, unless it is a measurement.
     """
     number = float(text)
     if math.isinf(number):
         raise DoesNotFit(f"{quote(text)} is not a finite number")
+    if not is_measurement and would_be_zero(text):
+        raise DoesNotFit(f"{quote(text)} is too small for {type.name}, which would hold 0")
     if type.is_float:
         return number
     exact = Decimal(text)
@@ -93,8 +99,9 @@ def _bytes(text: str, named: str) -> bytes:
         raise ValueError(f"{quote(text)} is not a valid {named}, allowed: base64") from None
 
 
-def _array(text: str, type: Type, named: str) -> list[Any]:
-    hook = partial(decimal_from, type=type) if type.is_number else None
+def _array(text: str, type: Type, named: str, is_measurement: bool) -> list[Any]:
+    parse = partial(decimal_from, type=type, is_measurement=is_measurement)
+    hook = parse if type.is_number else None
     try:
         items = msgspec.json.Decoder(float_hook=hook).decode(text)
     except msgspec.ValidationError as error:  # Of a number.

@@ -88,10 +88,11 @@ class _Lines(list[str]):
         self.append(line.removesuffix("\r\n") + "\n")
 
 
-def value_from(tag: Tag, text: str, *, states: bool = True) -> Any:
+def value_from(tag: Tag, text: str, *, states: bool = True, is_measurement: bool = False) -> Any:
     """Parses a value of a tag, or with `states` the name of one; `Tag.raw` then checks if it fits.
 
-    A text that is a name is that name, also if it looks like a number.
+    A text that is a name is that name, also if it looks like a number. A measurement may become 0
+    if it is too small.
 
     Raises `ValueError`.
     """
@@ -102,7 +103,7 @@ def value_from(tag: Tag, text: str, *, states: bool = True) -> Any:
     if tag.of_type.count is not None or not tag.is_number:
         if tag.of_type.count is None and tag.of_type.base in ("bool", "bit"):
             return _switched(word, names)
-        return from_text(text, tag.of_type, tag.type)
+        return from_text(text, tag.of_type, tag.type, is_measurement=is_measurement)
     if _INTEGER.fullmatch(word):
         # An integer has no sign of zero.
         is_minus_zero = tag.is_float and word[0] == "-" and int(word) == 0
@@ -110,7 +111,7 @@ def value_from(tag: Tag, text: str, *, states: bool = True) -> Any:
     if _HEX.fullmatch(word) and not tag.is_float and (tag.scale, tag.offset) == (1, 0):
         return int(word, 16)
     if _DECIMAL.fullmatch(word):
-        return decimal_from(word, tag.of_type)
+        return decimal_from(word, tag.of_type, is_measurement)
     if flaw := decimal_comma(word):
         raise DoesNotFit(f"{text!r} {flaw}")
     if names:

@@ -48,7 +48,7 @@ class PlainValue:
             if len(payload) > MAX_VALUE_BYTES:
                 raise ValueError(f"{len(payload)} bytes, allowed: {MAX_VALUE_BYTES}")
             text = bytes(payload).decode()
-            value = value_from(self._tag, text)
+            value = value_from(self._tag, text, is_measurement=True)
             values = self._codec.encode(self._tag.raw(value, default_round=ROUNDING_OF_MESSAGES))
         except UnicodeDecodeError:
             raise self._bad(payload, "the payload is not UTF-8") from None

@@ -26,6 +26,7 @@ from holdfast.cli.terminal_text import print_json
 from holdfast.client import requests
 from holdfast.errors import ModbusError
 from holdfast.protocol import WRITE_LIMITS
+from holdfast.runtime.text import would_be_zero
 from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
@@ -375,6 +376,8 @@ def _value(text: str, kind: str) -> Any:
         number = float(text)
         if math.isinf(number) and "inf" not in text.lower():
             raise click.UsageError(f"{text!r} is outside the range of {kind}.")
+        if would_be_zero(text):
+            raise click.UsageError(f"{text!r} is too small for {kind}, which would hold 0.")
         return number
     match = WHOLE.fullmatch(text)
     if match is None:

@@ -19,7 +19,7 @@ import msgspec
 
 from holdfast.net.http.requests import BadRequest, shown
 from holdfast.net.http.schemas import Schema, object_of
-from holdfast.runtime.text import all_of
+from holdfast.runtime.text import all_of, would_be_zero
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -131,8 +131,7 @@ def _without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _float(text: str) -> float:
     value = float(text)
-    would_be_zero = value == 0 and re.search("[1-9]", re.split("[eE]", text)[0])
-    if not math.isfinite(value) or would_be_zero:
+    if not math.isfinite(value) or would_be_zero(text):
         raise ValueError(f"{text[:40]} is out of range")
     return value
 
