@@ -74,6 +74,15 @@ def test_a_point_without_a_value_needs_no_scale() -> None:
         ({"type": "uint16"}, [43, 0, 100], 4300),
         ({"type": "uint16", "scale": 0.01}, [43, 0, 50], 21.5),
         ({"type": "float32"}, [215, 0, *values.encode(0.1, "float32")], 21.5),
+        ({"type": "float32", "scale": 0.5}, [100, 0, *values.encode(0.1, "float32")], 5),
+        ({"type": "float32", "offset": 0.2}, [10, 0, *values.encode(0.1, "float32")], 3),
+        ({"type": "float64", "scale": 0.7}, [10, 0, *values.encode(0.1, "float64")], 0.7),
+        ({"type": "float16", "scale": 2}, [100, 0, *values.encode(0.1, "float16")], 19.9951171875),
+        (
+            {"type": "float32", "scale": 10, "offset": -1},
+            [1, 0, *values.encode(0.1, "float32")],
+            "is 0.0, allowed: a finite number other than 0",
+        ),
         ({"type": "uint16"}, [43, 0, 0], "is 0, allowed: a finite number other than 0"),
         (
             {"type": "float32", "scale": 1 / 3},

@@ -17,7 +17,6 @@ from holdfast.tags.base import BaseTag, TagError
 from holdfast.values.digits import decimal_of
 from holdfast.values.errors import shown
 from holdfast.values.integers import as_integer
-from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
     from holdfast.values.types import Type
@@ -89,11 +88,11 @@ class RegisterScale:
                 allowed = f"exponents from {EXPONENTS[0]} to {EXPONENTS[-1]}"
                 raise ValueError(f"the scale in {self.where} is 10^{value}, allowed: {allowed}")
             return 10 ** int(value) if value >= 0 else float(f"1e{int(value)}")
-        if value == 0 or not is_finite(value):
+        if isinstance(content, float) and is_finite(content):  # As the tag is shown: in decimal.
+            value = self.source.value(Fraction(decimal_of(content, self.source.of_type.base)))
+        if not value or not is_finite(value):
             allowed = "a finite number other than 0"
             raise ValueError(f"the scale in {self.where} is {value}, allowed: {allowed}")
-        if isinstance(value, float) and value == content:
-            return float(decimal_of(value, parsed(self.source.type).base))
         return value
 
     def linear(self, content: Any, offset: float) -> Linear:
