@@ -320,7 +320,10 @@ def test_a_database_has_one_row_for_each_value(tmp_path: Path) -> None:
     database.send([reading(2**64 - 1)])
     assert database._db is not None
     rows = database._db.execute("SELECT * FROM readings").fetchall()
+    largest = database._db.execute("SELECT typeof(value) FROM readings ORDER BY value").fetchall()
     database.close()
+    # None sorts first, text last.
+    assert [kind for (kind,) in largest][1:4] == ["integer", "real", "real"]
     assert rows[0] == (TIME, "pump", "t", 21.5, "°C", None)
     values = [21.5, 1, "[1,2]", 'x,"y"\nz', "Af8=", None, float(2**64 - 1)]
     assert [row[3] for row in rows] == values

@@ -97,5 +97,5 @@ def _row(reading: Reading) -> tuple[Any, ...]:
     if isinstance(value, list):
         value = msgspec.json.encode(value).decode()
     elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-        value = float(value)
+        value = float(value)  # As text it would have all digits, but sort after all numbers.
     return time, device, tag, value, unit, error
