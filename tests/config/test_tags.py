@@ -439,6 +439,16 @@ QUOTES = "allowed: 1 to 64 letters, digits, '_', '.' and '-'; quote it to make i
             ["states.0: found false, allowed: text", "states.1: found true, allowed: text"],
         ),
         (
+            DEVICE.replace(
+                "address: 1", r"""address: 1, states: {0: "", 1: "on ", 2: "a\tb", 3: "\ud800"}"""
+            ).replace("coils", "holding_registers"),
+            [
+                f"tags.x.states.{number}: found {found}, allowed: a name without control "
+                "characters, and without blanks at its ends"
+                for number, found in enumerate(["''", "'on '", r"'a\tb'", r"'\ud800'"])
+            ],
+        ),
+        (
             "profiles: {p: p.csv}\n" + DEVICE,
             ["profiles.p: found 'p.csv', allowed: a mapping with the keys order, tags; files are"],
         ),

@@ -598,6 +598,19 @@ def test_every_mistake_is_told_with_its_line(imported: Callable[..., Imported]) 
     ]
 
 
+def test_a_mode_whose_name_no_state_has_is_a_mistake(imported: Callable[..., Imported]) -> None:
+    with pytest.raises(NotImportable) as raised:
+        imported(
+            "climates: [{name: hall, address: 30, target_temp_register: 31, hvac_mode_register: "
+            "{address: 32, values: {state_: 0, 'state_heat ': 1, state_cool: 2}}}]"
+        )
+    mode = "8: modbus[0].climates[0].hvac_mode_register.values"
+    assert [text.partition(", allowed")[0] for text in refusals(raised.value)] == [
+        f"{mode}.state_: found ''",
+        f"{mode}.'state_heat ': found 'heat '",
+    ]
+
+
 def refusals(error: NotImportable) -> list[str]:
     return [f"{each.line}: {each.key}: {each.message}" for each in error.problems]
 

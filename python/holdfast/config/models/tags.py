@@ -14,7 +14,7 @@ from pydantic.json_schema import WithJsonSchema
 from holdfast.config.models.base import INVALID, InvalidValue, Model
 from holdfast.config.models.memories import Register
 from holdfast.config.text.messages import show
-from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, Number
+from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, Number, check_state_name
 from holdfast.config.values.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
 from holdfast.tags import Tag, TagList
 from holdfast.tags.rounding import Rounding
@@ -27,6 +27,7 @@ def _written(marker: bool | int | float | str) -> bool | int | float | str:
     return str(marker) if isinstance(marker, float) and not isfinite(marker) else marker
 
 
+StateName = Annotated[str, AfterValidator(check_state_name)]
 Marker = Annotated[bool | int | float | str, AfterValidator(_written)]
 Scale = Annotated[
     float | ScaleConfig,
@@ -77,7 +78,7 @@ class TagConfig(Model):
     """The smallest value that may be written."""
     max: Annotated[Number | None, NotNull()] = None
     """The largest value that may be written."""
-    states: dict[int, str] = Field(default={}, json_schema_extra=_INTEGER_KEYS)
+    states: dict[int, StateName] = Field(default={}, json_schema_extra=_INTEGER_KEYS)
     """Names of values, by number."""
     null: Annotated[tuple[Marker, ...], Strict(False)] = ()
     """What the registers hold when no value is available, such as 65535 or nan."""

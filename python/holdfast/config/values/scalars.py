@@ -199,6 +199,18 @@ def check_file_path(value: str) -> str:
     return value
 
 
+def check_state_name(value: str) -> str:
+    """Raises `ValueError` for a name that a write would not take as it was published.
+
+    Empty text is no value, and blanks around a value are no part of it.
+    """
+    is_plain = all(unicodedata.category(character) not in ("Cc", "Cs") for character in value)
+    if not value or value != value.strip() or not is_plain:
+        allowed = "allowed: a name without control characters, and without blanks at its ends"
+        raise ValueError(f"found {show(value)}, {allowed}")
+    return value
+
+
 def _key_of(least: int, most: int, note: str = "") -> Callable[[object], UnitKey]:
     """A validator for keys that are a unit id or a range of unit ids."""
     allowed = f"a unit id from {least} to {most}, or a range, as in {EXAMPLE}{note}"

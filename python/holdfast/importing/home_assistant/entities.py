@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.config.text.messages import show
+from holdfast.config.values.scalars import check_state_name
 from holdfast.importing.key_reader import Section
 from holdfast.importing.names import MAX_LENGTH
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
@@ -529,9 +530,14 @@ def _mode(places: Places, entity: Section, key: str, *, writable: bool) -> None:
     if not given or values is None:
         entity.problem(key, "without address and values, allowed: with both")
         return
-    names = [(_PREFIX.sub("", str(key)), key) for key in values.data]
+    names: list[tuple[str, Any]] = []
+    for mode in values.data:
+        try:
+            names.append((check_state_name(_PREFIX.sub("", str(mode))), mode))
+        except ValueError as error:
+            values.problem(mode, str(error))
     names.sort(key=lambda each: _SEARCHED.index(each[0]) if each[0] in _SEARCHED else 99)
-    found = [(_numbers(values, key), name, values.at(key)) for name, key in names]
+    found = [(_numbers(values, mode), name, values.at(mode)) for name, mode in names]
     read = _states(
         entity.desk, ((number, name, path) for numbers, name, path in found for number in numbers)
     )
