@@ -94,6 +94,13 @@ def test_arrays_are_those_of_the_specification(
         assert value_of(Metric(bytes_value=packed), datatype) == values
 
 
+def test_a_text_of_an_array_has_no_nul_inside() -> None:
+    single, _ = datatype_of(Tag("x", "holding_registers", 0, "string:4"))
+    array, _ = datatype_of(Tag("x", "holding_registers", 0, "string:4[2]"))
+    assert single.packed("a\0b") == "a\0b"
+    assert array.packed(["a\0b", "cd"]) == b"ab\0cd\0"
+
+
 def test_an_integer_that_is_too_large_for_a_double_is_infinite() -> None:
     tag = Tag("x", "holding_registers", 0, "uint16[2]", scale=1e308)
     datatype, _ = datatype_of(tag)

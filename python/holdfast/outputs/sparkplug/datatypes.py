@@ -134,6 +134,7 @@ def _bits(values: list[bool]) -> bytes:
 
 
 def _texts(values: list[str]) -> bytes:
+    """Texts that end with NUL, as the specification has it: none can have one inside."""
     return b"".join(value.replace("\0", "").encode() + b"\0" for value in values)
 
 
