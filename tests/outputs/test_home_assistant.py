@@ -119,6 +119,16 @@ def test_numbers_have_the_bounds_of_the_tag_or_of_its_registers() -> None:
     assert (given["min"], given["max"], given["step"]) == (5, 30, 0.1)
     own = found(tag(type="uint16", scale=2, offset=10, **shared)).config
     assert (own["min"], own["max"], own["step"]) == (10, 131080, 2)
+    exact = tag(type="int16", scale=0.01, offset=273.15, **shared)
+    ends = found(exact).config
+    # In binary, the largest is 600.8199999999999, and Home Assistant would not send 600.82.
+    assert (
+        (ends["min"], ends["max"])
+        == (-54.53, 600.82)
+        == tuple(exact.value(end) for end in (-32768, 32767))
+    )
+    bcd = found(tag(type="bcd32", scale=-0.1, **shared)).config
+    assert (bcd["min"], bcd["max"]) == (-9999999.9, 0)
 
 
 def test_no_two_tags_have_one_id() -> None:

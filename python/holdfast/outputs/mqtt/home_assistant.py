@@ -12,8 +12,9 @@ import msgspec
 
 from holdfast._core import __version__
 from holdfast.net.addresses import address_in
-from holdfast.tags.scale import RegisterScale
+from holdfast.tags.scale import RegisterScale, linear_of
 from holdfast.tags.text import text_of
+from holdfast.values.numeric import limits
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -248,21 +249,12 @@ def _bounds(tag: Tag) -> dict[str, float]:
         step, low, high = MIN_STEP, -MAX_NUMBER, MAX_NUMBER
     else:
         step = max(abs(tag.scale), MIN_STEP)
-        ends = [limit * tag.scale + tag.offset for limit in _limits(tag)]
+        linear = linear_of(tag.scale, tag.offset)
+        ends = [linear.value(limit) for limit in limits(tag.of_type.base)]
         low, high = min(ends), max(ends)
     low = low if tag.min is None else tag.min
     high = high if tag.max is None else tag.max
     return {"min": low, "max": high, "step": step}
-
-
-def _limits(tag: Tag) -> tuple[int, int]:
-    """The least and the greatest number that the registers of an integer hold."""
-    bits, base = 16 * tag.count, tag.of_type.base
-    if base.startswith("bcd"):
-        return 0, 10 ** (bits // 4) - 1
-    if base.startswith("uint"):
-        return 0, 2**bits - 1
-    return -(2 ** (bits - 1)), 2 ** (bits - 1) - 1
 
 
 def _listed(names: Any) -> str:
