@@ -358,7 +358,8 @@ impl BlockingClient {
         let is_cancelled = || {
             let Some(is_cancelled) = &is_cancelled else { return false };
             // Without an answer, nothing is sent.
-            Python::attach(|py| is_cancelled.call0(py)?.is_truthy(py)).unwrap_or(true)
+            let asked = Python::try_attach(|py| is_cancelled.call0(py)?.is_truthy(py));
+            asked.is_none_or(|answer| answer.unwrap_or(true))
         };
         let may_send = |_| {
             let cancelled = || ClientError::Lost(Lost::Closed(Closed::BySelf));
@@ -436,7 +437,14 @@ impl BlockingClient {
                     return true;
                 }
                 // Before the handlers: nothing that one of them raised is lost.
-                raised = RAISED.take().or_else(|| Python::attach(|py| py.check_signals()).err());
+                raised = RAISED.take();
+                if raised.is_none() {
+                    // The end of the program has ended the interpreter: nobody waits for this call.
+                    let Some(checked) = Python::try_attach(|py| py.check_signals()) else {
+                        return true;
+                    };
+                    raised = checked.err();
+                }
                 raised.is_some()
             })
         });
@@ -447,13 +455,14 @@ impl BlockingClient {
 }
 
 /// Shows bytes to a function of Python. Its errors are only reported, because the device may have carried
-/// out the request. Returns what else it raised: `KeyboardInterrupt`, for example.
+/// out the request. Returns what else it raised: `KeyboardInterrupt`, for example. Shows nothing once
+/// the end of the program has ended the interpreter.
 pub fn show(trace: &Py<PyAny>, direction: Direction, bytes: &[u8]) -> Option<PyErr> {
     let word = match direction {
         Direction::Sent => "sent",
         Direction::Received => "received",
     };
-    Python::attach(|py| {
+    Python::try_attach(|py| {
         let trace = trace.bind(py);
         let error = trace.call1((word, PyBytes::new(py, bytes))).err()?;
         if !error.is_instance_of::<PyException>(py) {
@@ -462,6 +471,7 @@ pub fn show(trace: &Py<PyAny>, direction: Direction, bytes: &[u8]) -> Option<PyE
         error.write_unraisable(py, Some(trace));
         None
     })
+    .flatten()
 }
 
 /// Maps a file that cannot be read to the `OSError` subclass that Python itself would raise.
