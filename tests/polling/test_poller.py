@@ -308,6 +308,14 @@ def test_wrong_arguments_are_refused(
     assert poller.counters() == {}
 
 
+@pytest.mark.parametrize("tags", [[Tag("x", "coils", 1)], [("x", "coils", 1)], None])
+def test_tags_have_names(poller: Poller, tags: Any) -> None:
+    found = f"tags is a {type(tags).__name__}, allowed: a holdfast.TagList, or a tag for each name"
+    with pytest.raises(TypeError, match=found):
+        poller.add("tcp://127.0.0.1", tags)
+    assert poller.counters() == {}
+
+
 @pytest.mark.parametrize(
     ("gather", "error"),
     [(-1, ValueError), (float("nan"), ValueError), (1e9, ValueError), ("x", TypeError)],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -28,10 +29,13 @@ from holdfast.tags import Tag, TagList
 from holdfast.tags.read_gap import DEFAULT_MAX_GAP
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator, Mapping
+    from collections.abc import AsyncIterator, Iterator
     from concurrent.futures import Future, ThreadPoolExecutor
 
     from holdfast.polling.readings import DevicePoll
+
+TAGS = "{'flow': ('input_registers', 0, 'float32')}"
+"""An example, for errors."""
 
 SIGNAL_CHECK_S = 0.1
 """Seconds of one wait, between which signal handlers run."""
@@ -116,8 +120,8 @@ class Poller:
 
         Raises `ValueError` for invalid arguments, a name in use, a serial line that other devices
         have under another name, and options that differ from those of another device at the
-        address; `TypeError` if a time is not a number; `TagError` for an invalid tag, and
-        `RuntimeError` after `close`.
+        address; `TypeError` if a time is not a number, or `tags` neither a tag list nor a mapping;
+        `TagError` for an invalid tag, and `RuntimeError` after `close`.
         """
         interval = checked_seconds("interval", interval, MAX_INTERVAL_S, MIN_INTERVAL_S)
         timeout = checked_seconds("timeout", timeout, MAX_TIMEOUT_S)
@@ -303,6 +307,9 @@ class Poller:
 
 
 def _tags(tags: Mapping[str, Tag | tuple[Any, ...]]) -> Iterator[Tag]:
+    if not isinstance(tags, Mapping):
+        allowed = "a holdfast.TagList, or a tag for each name"
+        raise TypeError(f"tags is a {type(tags).__name__}, allowed: {allowed}, as in {TAGS}")
     for name, tag in tags.items():
         if isinstance(tag, Tag):
             yield tag if tag.name == name else replace(tag, name=name)
