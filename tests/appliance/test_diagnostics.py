@@ -4,8 +4,9 @@ its identification (43/14).
 
 from __future__ import annotations
 
+import re
 import struct
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -494,6 +495,13 @@ def test_a_value_too_long_for_a_reply_is_refused_at_the_start(memory: holdfast.M
     server = holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-only", identity=identity)
     with pytest.raises(ValueError, match="245"):
         server.start()
+
+
+@pytest.mark.parametrize("number", [-1, 0, 5, 7, 127, 256, 128.0, "128"])
+def test_a_private_object_has_an_id_of_those(number: Any) -> None:
+    message = re.escape(f"private_objects has the object id {number!r}, allowed: 128 to 255")
+    with pytest.raises(ValueError, match=message):
+        Identity(private_objects={number: "x"})
 
 
 def test_a_unit_has_its_own_name(memory: holdfast.Memory, serve: Serve, connect: Connect) -> None:

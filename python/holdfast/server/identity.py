@@ -6,9 +6,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from holdfast._core import __version__
+from holdfast.values.integers import as_integer
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+PRIVATE_OBJECTS = range(128, 256)
+"""The object ids that the standard leaves to makers (V1.1b3, 6.21)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +21,7 @@ class Identity:
 
     Text is sent as UTF-8, at most 244 bytes each. Optional objects with empty text are omitted.
     `unit_names`, by unit id 0 to 255, override `user_application_name`. `private_objects` are by
-    object id, 128 to 255.
+    object id, 128 to 255. Raises `ValueError` for a private object with another id.
     """
 
     vendor_name: str = "Holdfast"
@@ -29,6 +33,14 @@ class Identity:
     user_application_name: str = ""
     unit_names: Mapping[int, str] = field(default_factory=dict)
     private_objects: Mapping[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for given in self.private_objects:
+            number = as_integer(given)
+            # The core would serve ids 3 to 6 too, which have arguments of their own.
+            if number is None or number not in PRIVATE_OBJECTS:
+                allowed = f"{PRIVATE_OBJECTS[0]} to {PRIVATE_OBJECTS[-1]}"
+                raise ValueError(f"private_objects has the object id {given!r}, allowed: {allowed}")
 
     def objects(self) -> list[tuple[int, str]]:
         """Object ids and texts, the three mandatory objects first."""
