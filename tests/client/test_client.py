@@ -19,6 +19,8 @@ import sys
 import threading
 import time
 import warnings
+from array import array
+from collections import UserList, deque
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -61,7 +63,7 @@ from support.running import endpoint
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Iterator, Sequence
 
-    from holdfast.types import Area
+    from holdfast.types import Area, Integers
     from support.fake_device import Answer, Behaviour
     from support.running import Run, Serve
 
@@ -377,6 +379,44 @@ def test_a_large_write_takes_several_requests_if_that_is_allowed(
     assert memory.read(area, start, count) == values
     [counted] = server.counters()["requests"].values()
     assert counted == requests
+
+
+@pytest.mark.parametrize(
+    "of",
+    [
+        list,
+        tuple,
+        deque,
+        UserList,
+        lambda words: array("H", words),
+        lambda words: dict.fromkeys(words).keys(),
+    ],
+    ids=["list", "tuple", "deque", "user_list", "array", "keys"],
+)
+def test_a_write_of_any_sequence_may_take_several_requests(
+    of: Callable[[range], Integers], large: Large, dial: Dial
+) -> None:
+    server, memory = large
+    dial(url_of(server)).write_registers(7, of(range(200)), split=True)
+    assert memory.read("holding_registers", 7, 200) == list(range(200))
+
+
+@pytest.mark.parametrize(
+    ("values", "error", "message"),
+    [
+        (dict.fromkeys(range(200)), TypeError, "values are dict, not a sequence of integers"),
+        (set(range(200)), TypeError, "values are set, not a sequence of integers"),
+        (bytes(200), TypeError, "values are bytes, not a sequence of integers"),
+        (deque([0] * 199 + [65536]), ValueError, r"values\[199\] is 65536, allowed: integers 0 to"),
+        (deque([0] * 199 + [0.5]), TypeError, r"values\[199\] is 0.5, allowed: integers 0 to"),
+    ],
+)
+def test_a_write_in_several_requests_refuses_what_one_refuses(
+    values: Any, error: type[Exception], message: str, large: Large, dial: Dial
+) -> None:
+    with pytest.raises(error, match=message):
+        dial(url_of(large[0])).write_registers(0, values, split=True)
+    assert large[0].counters()["requests"] == {}
 
 
 def test_a_typed_value_may_take_several_requests(large: Large, dial: Dial) -> None:

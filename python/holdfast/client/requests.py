@@ -6,6 +6,7 @@ built, before anything is sent.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Awaitable, Callable, Generator
 from dataclasses import dataclass
 from operator import index
@@ -197,6 +198,7 @@ def write_range(
         raise TooManyValues(len(items), limit)
     size = _whole_elements(limit, element)
     starts = _starts(address, len(items), size)
+    items = _with_slices(make, address, items)
     try:
         requests = [
             make(start, items[start - address : start - address + size]) for start in starts
@@ -212,6 +214,22 @@ def write_range(
                 items_of = "coils" if area == "coils" else "registers"
                 error.note_written(start - address, f"{len(items)} {items_of}")
             raise
+
+
+def _with_slices(
+    make: Callable[[int, Integers], Request], address: int, items: Integers
+) -> Integers:
+    """The items, or a list of them if they have no slices, such as those of a deque.
+
+    Raises `TypeError` for what `make` refuses whatever its items are, such as a mapping.
+    """
+    try:
+        items[:0]
+    except (KeyError, TypeError):  # A mapping looks for a key.
+        with contextlib.suppress(ValueError):  # There are too many items for one request.
+            make(address, items)
+        return list(items)
+    return items
 
 
 def read_typed(area: Area, address: int, kind: str, order: str, encoding: str | None) -> Steps[Any]:
