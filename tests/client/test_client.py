@@ -1570,6 +1570,16 @@ def test_a_client_that_was_not_closed_begins_anew_when_its_event_loop_is_closed(
     assert any("unclosed transport" in str(warning.message) for warning in told)
 
 
+@pytest.mark.parametrize("url", ["tcp://127.0.0.1", "udp://127.0.0.1"])
+def test_a_copy_that_fails_says_so_once(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    reported: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda found: reported.append(found.exc_value))
+    with pytest.raises(TypeError, match="cannot pickle"):
+        copy.deepcopy(holdfast.Client(url))
+    gc.collect()
+    assert reported == []
+
+
 @pytest.mark.parametrize("is_connected", [True, False])
 def test_a_client_that_nobody_has_any_more_is_closed_in_its_event_loop(is_connected: bool) -> None:
     def forget(clients: list[holdfast.Client]) -> None:

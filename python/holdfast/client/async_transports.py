@@ -185,6 +185,9 @@ class ThreadedConnection:
 class AsyncConnection:
     """The connection of a client over TCP or TLS, in one event loop at a time."""
 
+    _last: _LoopConnection | None = None
+    """The connection of the latest loop. A copy that has failed has only this `None` at its end."""
+
     def __init__(
         self,
         target: NetworkTarget,
@@ -200,7 +203,7 @@ class AsyncConnection:
         renew_in_children(self, AsyncConnection._connect_anew)
 
     def _connect_anew(self) -> None:
-        self._last: _LoopConnection | None = None
+        self._last = None
 
     async def call(
         self,
