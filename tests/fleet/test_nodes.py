@@ -39,6 +39,7 @@ from support.scanner_parts import (
     registry_of,
     ttls_of,
 )
+from support.tentacle import subject_part
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -531,6 +532,21 @@ def test_messages_have_the_revision_of_the_lease(
     node("b")
     wire.until(lambda: headers, "values come from the other node")
     assert int(headers[-1]["Holdfast-Lease"]) > first
+
+
+def test_a_device_with_two_names_in_subjects_is_published_under_both(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    one = node("a")
+    share(one)
+    inboxes = [caller.listen(f"modbus.data.{name}") for name in ("K_che", subject_part("Küche"))]
+    client = client_of(one.scanner)
+    request = wanted(judges.devices[0], deviceId="Küche")
+    assert caller.request("modbus.subscribe", request)["success"]
+    for inbox in inboxes:
+        assert {inbox.next()["deviceId"] for _ in range(3)} == {"Küche"}
+    assert client_of(one.scanner) is client
+    assert client.stats["reconnects"] == 0
 
 
 def test_messages_over_a_new_connection_have_a_greater_number(

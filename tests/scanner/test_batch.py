@@ -42,6 +42,19 @@ def test_texts_are_messages_in_their_order(nats: NatsServer, caller: Caller) -> 
     assert "error" not in nats.log.lower()
 
 
+def test_a_text_gets_another_subject_with_and_without_a_lease(
+    nats: NatsServer, caller: Caller
+) -> None:
+    inbox = caller.listen("wire.>")
+    text = batch.text("wire.a", b'"PUB wire.a 1"')
+    leased = batch.leased(text, 12)
+    again = [batch.readdressed(each, "wire.größe") for each in (text, leased)]
+    assert again[1] == batch.leased(again[0], 12)
+    caller.do(batch.send(caller.client, b"".join((text, leased, *again)), 4))
+    assert [inbox.next() for _ in range(4)] == ["PUB wire.a 1"] * 4
+    assert "error" not in nats.log.lower()
+
+
 def test_texts_mix_with_what_the_client_publishes_itself(caller: Caller) -> None:
     inbox = caller.listen("wire.>")
 

@@ -44,9 +44,10 @@ def message(subject: str, content: msgspec.Struct) -> bytes:
     return text(subject, _encode(content))
 
 
-def readdressed(text: bytes, subject: str, other: str) -> bytes:
-    """Returns the text of a message to `subject` with another subject."""
-    return b"PUB %b" % other.encode() + text.removeprefix(b"PUB %b" % subject.encode())
+def readdressed(text: bytes, subject: str) -> bytes:
+    """Returns the text of a message, with or without headers, with another subject."""
+    verb, _, rest = text.split(b" ", 2)
+    return b"%b %b %b" % (verb, subject.encode(), rest)
 
 
 def lease_header(epoch: int) -> bytes:

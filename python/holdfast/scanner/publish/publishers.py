@@ -68,8 +68,8 @@ class Publishers:
         messages = self._publishers[id].messages(due, blocks)
         self._outbox.put(messages, of=id)
         if len(device.subjects) > 1:
-            one, other = (f"{self._prefix}.data.{name}" for name in device.subjects)
-            again = [((tag, other), batch.readdressed(text, one, other)) for tag, text in messages]
+            other = f"{self._prefix}.data.{device.subjects[1]}"
+            again = [((tag, other), batch.readdressed(text, other)) for tag, text in messages]
             self._outbox.put(again, of=id)
 
     def publish_state(self, device: ScannedDevice) -> None:
