@@ -51,6 +51,7 @@ def test_a_node_that_was_stopped_for_too_long_drops_what_waits() -> None:
 
         is_connected = True
         pending_data_size = 0
+        max_payload = 2**20
 
     async def work() -> None:
         lost = asyncio.Event()

@@ -22,7 +22,7 @@ from holdfast.scanner.subscriptions import device as devices
 from support import wire
 from support.brokers import NatsServer
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
-from support.nats_bus import Caller, leaving, subscription, tag
+from support.nats_bus import Caller, leaving, logged, subscription, tag
 from support.scanner_parts import broker_of, client_of, presence_of, registry_of
 
 if TYPE_CHECKING:
@@ -37,6 +37,25 @@ def events(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 # NATS
+
+
+def test_a_value_that_is_larger_than_a_message_costs_no_other(
+    run_scanner: Run,
+    small_nats: NatsServer,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    scanner = run_scanner(small_nats)
+    with Caller(small_nats.url) as caller:
+        data = caller.listen("modbus.data.plc1")
+        large = {**tag("bits", 0, "boolean[900]"), "functionCode": "coil"}
+        request = subscription(server, tag("a", 0), large, tag("b", 900))
+        assert caller.request("modbus.subscribe", request)["success"]
+        assert {data.next()["variableId"] for _ in range(10)} == {"a", "b"}
+        [found] = logged(caplog, "message_too_large")
+        assert (found["subject"], found["tag"]) == ("modbus.data.plc1", "bits")
+        assert client_of(scanner.scanner).stats["reconnects"] == 0
+        scanner.stop()
 
 
 def test_nats_comes_back_and_everything_goes_on_with_the_newest_values(

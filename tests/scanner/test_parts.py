@@ -6,11 +6,14 @@ import asyncio
 import json
 from typing import TYPE_CHECKING, Any, cast
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from nats.aio.msg import Msg
 
 from holdfast.client.url import NetworkTarget
+from holdfast.net.nats import batch
 from holdfast.net.nats import outbox as outboxes
 from holdfast.net.nats.connection import Broker, Ping, Servers
 from holdfast.net.nats.outbox import Outbox
@@ -19,10 +22,16 @@ from holdfast.scanner.commands import Commands
 from holdfast.scanner.dialects import TENTACLE
 from holdfast.scanner.errors import Moved
 from holdfast.scanner.jetstream.heartbeat import HeartbeatKey
-from holdfast.scanner.messages.types import BrowseRequest, HeartbeatMetadata, ServiceReport
+from holdfast.scanner.messages.types import (
+    BrowseRequest,
+    EntryReport,
+    HeartbeatMetadata,
+    ServiceReport,
+)
 from holdfast.scanner.placement import Placement
 from holdfast.scanner.publish.publisher import Publisher
 from holdfast.scanner.reports.browse import browsed
+from holdfast.scanner.responder import Responder
 from holdfast.scanner.settings import Settings
 from holdfast.scanner.subscriptions.device import (
     ScannedDevice,
@@ -38,6 +47,7 @@ from holdfast.scanner.subscriptions.request_rules import ScannerLimits
 from holdfast.scanner.subscriptions.tag import Tag
 from holdfast.tags.decoding import Places, decoder
 from support.nats_bus import logged
+from support.wire import DEADLINE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -362,6 +372,7 @@ class Wire:
     def __init__(self) -> None:
         self.is_connected = True
         self.pending_data_size = 0
+        self.max_payload = 2**20
         self.sent: list[bytes] = []
         self.stats = {"out_msgs": 0, "out_bytes": 0}
 
@@ -473,6 +484,79 @@ def test_the_newest_of_each_is_kept_while_they_are_not_taken(
     outbox, sent = asyncio.run(flow())
     assert sent == [b"b2c1d1", b"e1e2"]
     assert (outbox.sent, outbox.replaced, outbox.dropped) == (5, 2, 1)
+
+
+@pytest.mark.parametrize("how", ["connected", "away"])
+def test_a_message_that_the_server_does_not_take_is_dropped_and_logged_once(
+    how: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    small, most, large = (batch.text("d.x", b"1" * size) for size in (1, 100, 101))
+    leased = batch.leased(small, 12345678)
+    assert len(leased) < len(most)
+
+    async def flow() -> list[bytes]:
+        wire, outbox = Wire(), Outbox()
+        wire.max_payload = 100
+        if how == "connected":
+            outbox.connected(cast("SafeClient", wire))
+        outbox.put([("a", small), ("b", most), ("c", large), ("e", leased)], of="x")
+        outbox.put([("c", large), ("d", large)], of="x")
+        outbox.connected(cast("SafeClient", wire))
+        await _run(outbox)
+        return wire.sent
+
+    assert b"".join(asyncio.run(flow())) == small + most + leased
+    reason = "found 101 bytes, the server takes 100"
+    assert logged(caplog, "message_too_large") == [
+        {"subject": "d.x", "tag": tag, "reason": reason} for tag in "cd"
+    ]
+
+
+def test_an_answer_that_the_server_does_not_take_is_an_error() -> None:
+    async def answered() -> list[bytes]:
+        wire, outbox = Wire(), Outbox()
+        wire.max_payload = 100
+        outbox.connected(cast("SafeClient", wire))
+        responder = Responder(10, outbox)
+
+        async def handle(message: Msg) -> bytes:
+            return b"1" * len(message.data)
+
+        for size in (100, 101):
+            message = Msg(cast("Client", wire), reply="r", data=b"1" * size)
+            await responder.answering("browse", handle)(message)
+        await responder.finish(DEADLINE)
+        return wire.sent
+
+    error = b'{"success":false,"error":"the answer is too large: 101 bytes, the server takes 100"}'
+    texts = [batch.text("r", b"1" * 100), batch.text("r", error)]
+    assert asyncio.run(answered()) == texts
+
+
+def test_all_devices_are_browsed_beside_a_large_report_of_the_service() -> None:
+    most, devices = 20_000, {}
+    for number in range(40):
+        devices[f"d{number:02}"] = found = device(hmi=(1000, "scan", 0.0, "abcdefgh"))
+        found.id = f"d{number:02}"
+    entry = EntryReport(key="k" * 200, error="e" * 200)
+    service = ServiceReport(0, 0, 0, 0, 0, refused_entries=[entry] * 40)
+    ids: list[str] = []
+    while len(ids) < len(devices):
+        answer = browsed(BrowseRequest(offset=len(ids)), devices, {}, service, most)
+        assert len(msgspec.json.encode(answer)) <= most
+        assert answer.devices
+        ids += [each.device_id for each in answer.devices]
+        assert answer.next == (len(ids) if len(ids) < len(devices) else None)
+    assert ids == sorted(devices)
+
+
+def test_a_tag_that_does_not_fit_into_a_page_does_not_end_the_pages() -> None:
+    """Its subscribers may take more than a message."""
+    found = device(**{f"s{number}": (1000, "scan", 0.0, "ab") for number in range(200)})
+    service = ServiceReport(0, 0, 0, 0, 0)
+    request = BrowseRequest(device_id="plc", tag_offset=0)
+    answer = browsed(request, {"plc": found}, {}, service, 8192)
+    assert (answer.next_tag, answer.devices[0].tags) == (1, None)
 
 
 def judged(*polls: Sequence[int]) -> list[tuple[bool, str, int, str | None]]:

@@ -307,6 +307,20 @@ def own_nats(tmp_path: Path) -> Iterator[NatsServer]:
     server.kill()
 
 
+SMALL_PAYLOAD = 4096
+"""The size limit of messages of `small_nats` in bytes."""
+
+
+@pytest.fixture
+def small_nats(tmp_path: Path) -> Iterator[NatsServer]:
+    """A server of one test that ends the connection of a client with a larger message."""
+    file = tmp_path / "small.conf"
+    file.write_text(f"max_payload: {SMALL_PAYLOAD}\n")
+    server = NatsServer(tmp_path, "-c", str(file))
+    yield server
+    server.kill()
+
+
 @pytest.fixture
 def caller(nats: NatsServer) -> Iterator[Caller]:
     with Caller(nats.url) as caller:

@@ -42,7 +42,7 @@ FIELDS = {
 }
 """Where fields of the log are in a document. All others are below `holdfast`."""
 
-MESSAGES = ("request_refused", "message_malformed")
+MESSAGES = ("request_refused", "message_malformed", "message_too_large")
 """Events whose `subject` is that of a NATS message, not of a certificate."""
 
 NUMBERS = (

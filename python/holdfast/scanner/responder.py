@@ -50,6 +50,11 @@ class Responder:
             answer = await self._answer(kind, handle, message)
             if message.reply:
                 payload = answer if isinstance(answer, bytes) else msgspec.json.encode(answer)
+                if len(payload) > self._outbox.max_payload:
+                    # The server would end the connection, at each repetition of the request.
+                    size = f"{len(payload)} bytes, the server takes {self._outbox.max_payload}"
+                    error = Answer(success=False, error=f"the answer is too large: {size}")
+                    payload = msgspec.json.encode(error)
                 await self._outbox.answer(message.reply, payload)
 
         async def begin(message: Msg) -> None:

@@ -126,7 +126,6 @@ class Scanner:
             self._buckets,
             self._placement,
             self._responder,
-            self._client,
         )
         self._broker = Broker(
             settings.servers,

@@ -50,6 +50,13 @@ def readdressed(text: bytes, subject: str) -> bytes:
     return b"%b %b %b" % (verb, subject.encode(), rest)
 
 
+def subject_and_size(text: bytes) -> tuple[str, int]:
+    """Returns the subject of the text of a message, and the bytes of its headers and payload."""
+    head, _, _ = text.partition(b"\r\n")
+    _, subject, *sizes = head.split(b" ")
+    return subject.decode(), int(sizes[-1])
+
+
 def lease_header(epoch: int) -> bytes:
     """Returns the headers of a message with the revision of a lease."""
     return b"NATS/1.0\r\n%b: %d\r\n\r\n" % (LEASE, epoch)

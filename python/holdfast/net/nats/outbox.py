@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING
 
 from nats.errors import Error
 
+from holdfast.events import log_lines
 from holdfast.net.nats import batch
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Collection
 
     from holdfast.net.nats.tolerant_client import SafeClient
 
@@ -30,6 +31,12 @@ MAX_BATCH_BYTES = 512 * 1024
 
 MAX_KEPT_MESSAGES = 200_000
 """Limit of kept messages."""
+
+USUAL_MAX_PAYLOAD_BYTES = 2**20
+"""The size limit of messages, before a server sends its own."""
+
+MAX_REMEMBERED = 10_000
+"""Limit of remembered messages that were too large."""
 
 CHECK_INTERVAL_S = 0.005
 """Time between checks whether a slow connection accepts more."""
@@ -52,7 +59,9 @@ class Outbox:
         self._client: SafeClient | None = None
         self._queue: list[bytes] = []
         self._queue_bytes = 0
-        self._kept: OrderedDict[object, bytes] = OrderedDict()
+        self._kept: OrderedDict[tuple[object, object], bytes] = OrderedDict()
+        self._too_large: set[tuple[object, object]] = set()
+        """Messages of which it is logged that they are too large."""
         self._has_messages = asyncio.Event()
         self.sent = 0
         """Messages sent to the connection."""
@@ -66,15 +75,27 @@ class Outbox:
         self._client = client
         self._has_messages.set()
 
-    def put(self, messages: Iterable[tuple[object, bytes]], of: object = None) -> None:
-        """Adds messages `of` a device, each with a key such as its tag; a newer one replaces it."""
+    @property
+    def max_payload(self) -> int:
+        """The size limit of messages in bytes. The server ends a connection with a larger one."""
+        return USUAL_MAX_PAYLOAD_BYTES if self._client is None else self._client.max_payload
+
+    def put(self, messages: Collection[tuple[object, bytes]], of: object = None) -> None:
+        """Adds messages `of` a device, each with a key such as its tag; a newer one replaces it.
+
+        Messages that are larger than the server allows are dropped, and logged once.
+        """
         if self._kept or self._queue_bytes > MAX_BACKLOG_BYTES or not self._accepts():
             for key, text in messages:
                 self._keep((of, key), text)
         else:
             texts = [text for _, text in messages]
+            size, most = sum(map(len, texts)), self.max_payload
+            if size > most and max(map(len, texts)) > most:
+                texts = [text for key, text in messages if self._fits((of, key), text)]
+                size = sum(map(len, texts))
             self._queue += texts
-            self._queue_bytes += sum(map(len, texts))
+            self._queue_bytes += size
         self._has_messages.set()
 
     async def answer(self, subject: str, payload: bytes) -> None:
@@ -123,12 +144,31 @@ class Outbox:
 
     def _oldest(self) -> list[bytes]:
         """Removes and returns the oldest kept messages, about `MAX_BATCH_BYTES` bytes."""
-        texts, size = [], 0
+        texts, size, most = list[bytes](), 0, self.max_payload
         while self._kept and size < MAX_BATCH_BYTES:
-            _, text = self._kept.popitem(last=False)
-            texts.append(text)
-            size += len(text)
+            key, text = self._kept.popitem(last=False)
+            # Not before: the server to which it is sent may have another limit.
+            if len(text) <= most or self._fits(key, text):
+                texts.append(text)
+                size += len(text)
         return texts
+
+    def _fits(self, key: tuple[object, object], text: bytes) -> bool:
+        """Returns whether the server takes a message. Logs once of each key that it does not."""
+        subject, size = batch.subject_and_size(text)
+        if size <= self.max_payload:
+            return True
+        if key not in self._too_large:
+            if len(self._too_large) >= MAX_REMEMBERED:
+                # Logging a message twice is harmless; memory without limit is not.
+                self._too_large.clear()
+            self._too_large.add(key)
+            fields = {"tag": key[1]} if isinstance(key[1], str) and key[1] != subject else {}
+            reason = f"found {size} bytes, the server takes {self.max_payload}"
+            log_lines.refused(
+                "message_too_large", kind="nats", subject=subject, **fields, reason=reason
+            )
+        return False
 
     def _accepts(self) -> bool:
         """Returns whether the connection currently accepts more."""
@@ -137,7 +177,7 @@ class Outbox:
             client is not None and client.is_connected and batch.backlog(client) < MAX_BACKLOG_BYTES
         )
 
-    def _keep(self, key: object, text: bytes) -> None:
+    def _keep(self, key: tuple[object, object], text: bytes) -> None:
         # A replacement keeps the position of the older message, so it can't wait forever.
         if key in self._kept:
             self.replaced += 1

@@ -69,8 +69,8 @@ class Publishers:
         self._outbox.put(messages, of=id)
         if len(device.subjects) > 1:
             other = f"{self._prefix}.data.{device.subjects[1]}"
-            again = [((tag, other), batch.readdressed(text, other)) for tag, text in messages]
-            self._outbox.put(again, of=id)
+            again = [(tag, batch.readdressed(text, other)) for tag, text in messages]
+            self._outbox.put(again, of=(id, other))
 
     def publish_state(self, device: ScannedDevice) -> None:
         """Publishes and stores the state of a device, if this scanner polls it."""

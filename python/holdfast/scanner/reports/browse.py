@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 _encode = msgspec.json.Encoder().encode
 
 ENVELOPE_BYTES = 1024
-"""Bytes of an answer without devices, and of the errors that the polling node adds to a page."""
+"""Bytes of an answer without devices and `service`, and of the errors that the polling node adds to
+a page."""
 
 MIN_TAG_BYTES = 100
 """The fewest bytes of a tag in an answer. It limits how many tags can fit."""
@@ -52,6 +53,7 @@ def browsed(
     Raises `Refused` for `tagOffset` without `deviceId`.
     """
     answer = BrowseAnswer(True, len(devices), service, [])
+    max_bytes -= len(_encode(service))
     room = max_bytes - ENVELOPE_BYTES
     if request.device_id is not None:
         if request.device_id in devices:
@@ -65,7 +67,7 @@ def browsed(
     for at, id in enumerate(sorted(devices)[first:], first):
         whole = DeviceReporter(devices[id], counters).whole(max_bytes)
         size = len(_encode(whole)) + 1
-        if size > room:
+        if size > room and answer.devices:
             answer.next = at
             break
         room -= size
@@ -99,10 +101,11 @@ class DeviceReporter:
         while True:
             report = self._with(left[:count])
             size = len(_encode(report)) + 1
+            following = None if count == len(left) else offset + count
             if size <= room:
-                return report, None if count == len(left) else offset + count
+                return report, following
             if count <= 1:
-                return self._head(), None
+                return self._head(), following
             count = min(count - 1, max(count * room // size, 1))
 
     def _head(self) -> DeviceReport:

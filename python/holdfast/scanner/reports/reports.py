@@ -18,9 +18,8 @@ from holdfast.scanner.reports.browse import DeviceReporter, browsed
 from holdfast.scanner.reports.variables import variable, variables
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
-    from nats.aio.client import Client
     from nats.aio.msg import Msg
 
     from holdfast.net.nats.outbox import Outbox
@@ -35,9 +34,6 @@ if TYPE_CHECKING:
     from holdfast.scanner.settings import Settings
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
-
-USUAL_MAX_PAYLOAD_BYTES = 2**20
-"""The size limit of messages, before a NATS server sends its own."""
 
 MISSED_COUNT_INTERVAL_S = 10.0
 """Between two counts of missed scans for other nodes: many devices take milliseconds."""
@@ -59,16 +55,13 @@ class Reports:
     _buckets: Buckets
     _placement: Placement
     _responder: Responder
-    _client: Callable[[], Client | None]
-    """Returns the client while there is a connection."""
     _missed: int = 0
     _missed_counted_at: float = -math.inf
 
     @property
     def max_bytes(self) -> int:
         """The size limit of an answer."""
-        client = self._client()
-        return USUAL_MAX_PAYLOAD_BYTES if client is None else client.max_payload
+        return self._outbox.max_payload
 
     def request(self, message: Msg, kind: type[Decoded]) -> Decoded:
         """Parses a request; an empty one is valid. Raises `Refused`."""
