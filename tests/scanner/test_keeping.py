@@ -19,7 +19,7 @@ from holdfast.scanner.jetstream.store import BUCKET
 from holdfast.scanner.publish.publishers import Publishers
 from support import wire
 from support.brokers import NatsServer
-from support.nats_bus import Caller, leaving, logged, subscription, tag
+from support.nats_bus import SMALL_PAYLOAD, Caller, leaving, logged, subscription, tag
 from support.tentacle import plc_subscribe, plc_tag, plc_unsubscribe
 
 if TYPE_CHECKING:
@@ -191,6 +191,59 @@ def test_a_large_subscription_is_kept_in_parts(
     assert caller.request("modbus.unsubscribe", leaving() | {"tagIds": "all"})["success"]
     assert caller.kept(BUCKET) == {}
     second.stop()
+
+
+def test_no_part_of_a_subscription_is_larger_than_a_message(
+    run_scanner: Run, small_nats: NatsServer, server: holdfast.Server
+) -> None:
+    first = run_scanner(small_nats)
+    with Caller(small_nats.url) as caller:
+        for start in range(0, 200, 10):
+            tags = [
+                tag(f"t{number}", number, description="d" * 100)
+                for number in range(start, start + 10)
+            ]
+            request = subscription(server, *tags, scanRate=60_000)
+            assert caller.request("modbus.subscribe", request)["success"]
+        assert len(subscriptions(caller)) > 1
+        first.stop()
+        second = run_scanner(small_nats)
+        assert device(caller, "plc1")["tagCount"] == 200
+        second.stop()
+
+
+def test_a_tag_that_is_larger_than_a_message_costs_only_itself(
+    run_scanner: Run,
+    small_nats: NatsServer,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    first = run_scanner(small_nats)
+
+    def asked(id: str, description: str) -> dict[str, Any]:
+        return subscription(server, tag(id, 0, description=description), scanRate=60_000)
+
+    # What is stored has the defaults, too.
+    empty = len(json.dumps(asked("large", ""), ensure_ascii=False))
+    large = asked("large", "ü" * ((SMALL_PAYLOAD - empty) // 2))
+    with Caller(small_nats.url) as caller:
+        assert caller.request("modbus.subscribe", asked("a", ""))["success"]
+        text = json.dumps(large, ensure_ascii=False)
+        reason = "subscribed, but not kept: an entry takes "
+        for _ in range(2):
+            answer = caller.request("modbus.subscribe", text)
+            assert not answer["success"]
+            assert answer["error"].startswith(reason)
+        [found] = logged(caplog, "subscriptions_not_kept")
+        assert (found["device"], found["subscriber"]) == ("plc1", "hmi")
+        other = asked("b", "") | {"subscriberId": "historian"}
+        assert caller.request("modbus.subscribe", other)["success"]
+        assert "modbus.subscription.historian.plc1.0" in subscriptions(caller)
+        assert device(caller, "plc1")["tagCount"] == 3
+        first.stop()
+        second = run_scanner(small_nats)
+        assert [each["id"] for each in device(caller, "plc1")["tags"]] == ["a", "b"]
+        second.stop()
 
 
 def test_the_state_of_a_device_is_there_for_those_who_come_late(

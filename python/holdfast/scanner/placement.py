@@ -204,8 +204,12 @@ class Placement:
     def state_changed(self, device: str) -> None:
         """Notes that the state of a device has changed, or that the device is gone."""
 
-    async def settled(self, subscription: SubscriptionKey) -> None:
-        """Waits until a changed subscription is stored; not while JetStream fails."""
+    async def settled(self, _subscription: SubscriptionKey, /) -> str | None:
+        """Waits until a changed subscription is stored; not while JetStream fails.
+
+        Returns why it can't be stored, if so.
+        """
+        return None
 
     async def write(
         self,

@@ -128,10 +128,12 @@ class Requests:
                 )
         self.former.pop(subscription.key, None)
         # Outside the lock: storing can take seconds, and other requests need not wait for it.
-        await self._placement.settled(subscription.key)
+        unstored = await self._placement.settled(subscription.key)
         self._log.adjusted(subscription.subscriber, subscription.device, adjustments)
         self._log.byte_orders(subscription, adjustments, new)
         self._log.subscribed(subscription)
+        if unstored is not None:
+            return Answer(success=False, error=f"subscribed, but not kept: {unstored}")
         count = len(request.tags) if request.profile is None else len(subscription.tags)
         return Answer(success=True, count=count)
 

@@ -61,10 +61,13 @@ def _token(text: str) -> str:
     return "=" + base64.urlsafe_b64encode(text.encode()).rstrip(b"=").decode()
 
 
-def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
+def requests(
+    device: ScannedDevice, subscriber: str, max_bytes: int = MAX_ENTRY_BYTES
+) -> Iterator[bytes]:
     """Yields the requests that make the subscription of a subscriber, each of limited size.
 
-    Each has the profile, if there is one: it adds the tags that the profile has gained.
+    Each has the profile, if there is one: it adds the tags that the profile has gained. One is
+    larger than `max_bytes` only if it has a single tag.
     """
     known = device.subscribers[subscriber]
     head = {
@@ -82,17 +85,19 @@ def requests(device: ScannedDevice, subscriber: str) -> Iterator[bytes]:
         "profile": known.profile,
     }
     before = _encode({key: value for key, value in head.items() if value is not None})[:-1]
+    before, after = before + b',"tags":[', b"]}"
+    room = min(MAX_PART_BYTES, max_bytes - len(before) - len(after))
     part: list[bytes] = []
     size = 0
     for id, options in known.tags.items():
         text = _tag(device.tags[id], options, known.profile)
-        if part and size + len(text) > MAX_PART_BYTES:
-            yield before + b',"tags":[' + b",".join(part) + b"]}"
+        if part and size + len(text) > room:
+            yield before + b",".join(part) + after
             part, size = [], 0
         part.append(text)
-        size += len(text)
+        size += len(text) + len(b",")
     if part:
-        yield before + b',"tags":[' + b",".join(part) + b"]}"
+        yield before + b",".join(part) + after
 
 
 def restored(value: bytes) -> SubscribeRequest:

@@ -96,9 +96,9 @@ class StoredSubscriptions(Placement):
         if left:
             self._pending[owner] = left
 
-    async def settled(self, subscription: SubscriptionKey) -> None:
+    async def settled(self, subscription: SubscriptionKey, /) -> str | None:
         """Waits until a changed subscription is stored; not while JetStream fails."""
-        await self._store.settled(subscription)
+        return await self._store.settled(subscription)
 
     def _touch(self, owner: SubscriptionKey) -> None:
         self._pending.pop(owner, None)
@@ -120,7 +120,7 @@ class StoredSubscriptions(Placement):
             return {status_key(self._prefix, device.id): device.status}
         if owner.subscriber not in device.subscribers:
             return {}
-        values = requests(device, owner.subscriber)
+        values = requests(device, owner.subscriber, self._store.max_bytes)
         return numbered(self._prefix, device.id, owner.subscriber, values)
 
     def _on_read(self, entries: list[tuple[str, bytes]]) -> Mapping[str, SubscriptionKey]:

@@ -9,10 +9,13 @@ is optional: without it, nothing is kept, and nothing waits for it.
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import TYPE_CHECKING
 
 from nats.js.errors import NotFoundError
 
+from holdfast.events import log_lines
+from holdfast.net.nats.outbox import USUAL_MAX_PAYLOAD_BYTES
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
 from holdfast.scanner.jetstream.availability import (
@@ -68,6 +71,10 @@ class EntryStore:
         self._waiting: dict[SubscriptionKey, asyncio.Event] = {}
         self._stored: dict[SubscriptionKey, dict[str, int]] = {}
         """The hashes of the stored entries, by key."""
+        self._too_large: dict[SubscriptionKey, str] = {}
+        """Owners of which an entry is too large for the server, and why: it is not stored."""
+        self.max_bytes = USUAL_MAX_PAYLOAD_BYTES
+        """The size limit of an entry: that of messages."""
         events = "subscriptions_kept", "subscriptions_not_kept"
         self._availability = Availability(*events, bucket=BUCKET)
         self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
@@ -85,6 +92,8 @@ class EntryStore:
     def connected(self, client: Client | None) -> None:
         """Sets the client; `None` while there is no connection."""
         self._client = client
+        if client is not None:
+            self.max_bytes = client.max_payload
         self._has_work.set()
 
     def touch(self, owner: SubscriptionKey) -> None:
@@ -92,13 +101,17 @@ class EntryStore:
         self._touched.add(owner)
         self._has_work.set()
 
-    async def settled(self, owner: SubscriptionKey) -> None:
-        """Waits until the entries of a touched owner are stored; not while JetStream fails."""
+    async def settled(self, owner: SubscriptionKey) -> str | None:
+        """Waits until the entries of a touched owner are stored; not while JetStream fails.
+
+        Returns why one of them can't be stored, if so.
+        """
         if not self._availability.is_available or self._client is None:
-            return
+            return None
         if owner in self._touched or owner in self._writing:
             stored = self._waiting.setdefault(owner, asyncio.Event())
             await stored.wait()
+        return self._too_large.get(owner)
 
     async def run(self) -> None:
         """Reads the entries after each connection, and writes changes, until it is cancelled."""
@@ -187,7 +200,7 @@ class EntryStore:
     async def _write_owner(
         self, jetstream: JetStreamContext, bucket: KeyValue, owner: SubscriptionKey
     ) -> None:
-        entries = self._entries(owner)
+        entries = self._without_too_large(owner)
         stored = self._stored.setdefault(owner, {})
         for key, value in entries.items():
             if stored.get(key) != hash(value):  # A hash: values may take 128 KiB each.
@@ -199,6 +212,20 @@ class EntryStore:
             del stored[key]
         if not stored:
             del self._stored[owner]
+
+    def _without_too_large(self, owner: SubscriptionKey) -> Mapping[str, bytes]:
+        """Returns the entries of an owner that can be stored. The others must not delay any."""
+        entries = self._entries(owner)
+        sizes = [len(value) for value in entries.values() if len(value) > self.max_bytes]
+        if not sizes:
+            self._too_large.pop(owner, None)
+            return entries
+        reason = f"an entry takes {max(sizes)} bytes, the server takes {self.max_bytes}"
+        if self._too_large.get(owner) != reason:
+            self._too_large[owner] = reason
+            fields = {"bucket": BUCKET, **owner.fields}
+            log_lines.write(logging.WARNING, "subscriptions_not_kept", **fields, reason=reason)
+        return {key: value for key, value in entries.items() if len(value) <= self.max_bytes}
 
     def _release(self) -> None:
         """Lets requests go on that wait for JetStream."""
