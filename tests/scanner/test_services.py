@@ -275,6 +275,32 @@ def test_the_last_value_stays_while_the_device_fails(
         assert variables(caller)["plc1", "a"]["value"] == 7
 
 
+def test_a_variable_that_is_larger_than_an_answer_does_not_hide_the_next(
+    run_scanner: Run, small_nats: NatsServer, server: holdfast.Server
+) -> None:
+    scanner = run_scanner(small_nats)
+    with Caller(small_nats.url) as caller:
+        large = {**tag("bits", 0, "boolean[900]"), "functionCode": "coil"}
+        request = subscription(server, tag("a", 0), large, tag("b", 1))
+        assert caller.request("modbus.subscribe", request)["success"]
+
+        def paged() -> list[Any]:
+            found: list[Any] = []
+            while more := caller.request("modbus.variables", {"offset": len(found)}):
+                found += more
+            return found
+
+        read = [("a", "good"), ("bits", "bad"), ("b", "good")]
+        wire.until(
+            lambda: [(each["variableId"], each["quality"]) for each in paged()] == read,
+            "all are read",
+        )
+        found = paged()[1]
+        assert found["value"] is None
+        assert found["error"].startswith("too large: found ")
+        scanner.stop()
+
+
 def test_the_answer_has_as_many_variables_as_fit(
     run_scanner: Run, caller: Caller, server: holdfast.Server
 ) -> None:

@@ -233,4 +233,4 @@ class NodeAnswers:
         """Returns as many reports as fit into a message."""
         encode, room = msgspec.json.encode, self._reports.max_bytes - ENVELOPE_BYTES
         texts = (encode(id) + b":" + encode(content) for id, content in reports)
-        return b'{"devices":{' + joined(texts, room) + b"}}"
+        return b'{"devices":{' + joined(texts, room)[0] + b"}}"

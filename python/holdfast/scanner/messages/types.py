@@ -240,13 +240,15 @@ class Variable(_Message, omit_defaults=True):
     """The latest value that was read, also while the device is offline."""
     datatype: DataType
     quality: Quality
-    """`good`: of the last scan; `bad`: older, or not decodable; `uncertain`: not read yet."""
+    """`good`: of the last scan; `bad`: older, not decodable, or too large for a message;
+    `uncertain`: not read yet."""
     origin: str
     last_updated: int | None = None
     """Time of the device's response, in milliseconds since 1970."""
     description: str | None = None
     error: str | None = None
-    """Why the entry that has the tag is refused; only with dialect `tentacle-next`."""
+    """Why the entry that has the tag is refused, with dialect `tentacle-next`; or that the variable
+    is too large for a message."""
 
 
 class BlockReport(_Message, omit_defaults=True):

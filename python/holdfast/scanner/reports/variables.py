@@ -44,18 +44,37 @@ def variables(
         (variable(*each, module) for each in islice(tags, offset, None)),
         islice(_refused(request, devices, refused, module), skipped, None),
     )
-    return b"[" + joined(map(_encode, found), max_bytes - ENVELOPE_BYTES) + b"]"
+    room = max_bytes - ENVELOPE_BYTES
+    text, _ = joined((fitting(each, room) for each in found), room)
+    return b"[" + text + b"]"
 
 
-def joined(texts: Iterable[bytes], room: int) -> bytes:
-    """Joins the first texts, as many as fit into so many bytes, with commas."""
-    fitting: list[bytes] = []
+def joined(texts: Iterable[bytes], room: int) -> tuple[bytes, bool]:
+    """Joins the first texts, as many as fit into so many bytes, with commas.
+
+    Returns also whether all of them fit.
+    """
+    first: list[bytes] = []
+    room += 1  # The first one has no comma.
     for text in texts:
         room -= len(text) + 1
         if room < 0:
-            break
-        fitting.append(text)
-    return b",".join(fitting)
+            return b",".join(first), False
+        first.append(text)
+    return b",".join(first), True
+
+
+def fitting(found: Variable, room: int) -> bytes:
+    """Returns a variable as JSON; without its value, with an error, if it takes more than `room`.
+
+    Callers ask for the next ones until there are none: each must fit into an answer.
+    """
+    text = _encode(found)
+    if len(text) <= room:
+        return text
+    error = f"too large: found {len(text)} bytes, an answer takes {room}"
+    less = msgspec.structs.replace(found, value=None, quality="bad", description=None, error=error)
+    return _encode(less)
 
 
 def _refused(
