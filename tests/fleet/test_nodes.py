@@ -16,6 +16,7 @@ from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.net.nats.connection import Servers
+from holdfast.net.nats.outbox import Outbox
 from holdfast.replication.leases.bucket import Outdated
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.scanner.fleet import reports
@@ -507,6 +508,55 @@ def test_browse_and_variables_tell_of_all_nodes(
         assert len(caller.request("modbus.variables", {"offset": 3})) == 1
         [value] = caller.request("modbus.variables", {"deviceId": "d2"})
         assert (value["variableId"], value["quality"]) == ("t2", "good")
+
+
+@pytest.mark.parametrize(
+    ("most", "connections", "id", "count", "tags"),
+    [(4500, 4, "d{:02}", 8, 60), (20_000, 1, f"{'d' * 100}{{:02}}", 24, 6)],
+    ids=["of one device", "of one node"],
+)
+def test_what_other_nodes_report_is_whole_though_it_takes_several_messages(
+    node: Callable[..., Running],
+    caller: Caller,
+    judges: Judges,
+    monkeypatch: pytest.MonkeyPatch,
+    most: int,
+    connections: int,
+    id: str,
+    count: int,
+    tags: int,
+) -> None:
+    monkeypatch.setattr(Outbox, "max_payload", most)
+    one, two = node("a"), node("b")
+    share(one, two)
+    made = [
+        {"id": f"t{number:02}", "address": 0, "functionCode": "holding", "datatype": "uint16"}
+        for number in range(tags)
+    ]
+    ids = [id.format(number) for number in range(count)]
+    for number, each in enumerate(ids):
+        request = wanted(judges.devices[number % connections], deviceId=each, tags=made)
+        assert caller.request("modbus.subscribe", request | {"unitId": 1 + number})["success"]
+
+    def values() -> list[tuple[str, str, str]]:
+        found: list[Any] = []
+        while more := caller.request("modbus.variables", {"offset": len(found)}):
+            found += more
+        return [(each["deviceId"], each["variableId"], each["quality"]) for each in found]
+
+    def states() -> list[tuple[str, str, bool]]:
+        found, answer = [], {"next": 0}
+        while "next" in answer:
+            answer = caller.request("modbus.browse", {"offset": answer["next"]})
+            found += answer["devices"]
+        return [(each["deviceId"], each["state"], each["scans"] > 0) for each in found]
+
+    good = [(device, each["id"], "good") for device in ids for each in made]
+    online = [(device, "online", True) for device in ids]
+    wire.until(lambda: values() == good, "all are polled")
+    for _ in range(6):
+        assert values() == good
+        assert states() == online
 
 
 def test_messages_have_the_revision_of_the_lease(

@@ -107,7 +107,7 @@ class ReportHost(ReportHandlers, Protocol):
     def device_reports(self, ids: Iterable[str]) -> Iterator[tuple[str, DeviceReport]]:
         """Yields the reports of these devices, as far as they are known."""
 
-    def device_variables(self, ids: Iterable[str]) -> Iterator[tuple[str, list[Variable]]]:
+    def device_variables(self, ids: Iterable[str]) -> Iterator[tuple[str, Iterator[Variable]]]:
         """Yields the latest values of these devices, as far as they are known."""
 
     def counts(self) -> Mapping[str, int]:

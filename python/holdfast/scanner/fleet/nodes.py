@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import time
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import msgspec
@@ -17,10 +18,10 @@ from holdfast.net.nats.connection import nats_reason
 from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import STOPPING, Moved, NotConfirmed, Refused
 from holdfast.scanner.fleet.partition_leases import PARTITION
-from holdfast.scanner.reports.variables import joined
+from holdfast.scanner.reports.variables import fitting, joined
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable
+    from collections.abc import Awaitable, Callable
 
     from nats.aio.msg import Msg
 
@@ -68,12 +69,16 @@ class ReportQuestion(msgspec.Struct, kw_only=True):
     """Asks for reports, or for variables, of devices that the other node polls."""
 
     devices: list[str]
+    offset: int = 0
+    """The number of variables of the first device to skip."""
 
 
 class NodeReports(msgspec.Struct, kw_only=True):
     """The reports, or the variables, of some of the devices: as many as fit into a message."""
 
     devices: dict[str, Any]
+    is_full: bool = False
+    """Whether some did not fit: the next devices, or variables of the last one."""
 
 
 def subject(prefix: str, node: str, what: str, process: str = "") -> str:
@@ -151,29 +156,38 @@ class OtherNodes:
             raise (NotConfirmed if done.not_confirmed else Refused)(done.error)
         return None
 
-    async def reports(self, what: str, devices: list[ScannedDevice]) -> dict[str, Any]:
-        """Returns what other nodes report of their devices, except nodes that don't answer."""
+    async def reports(
+        self, what: str, devices: list[ScannedDevice], offset: int = 0
+    ) -> tuple[dict[str, Any], set[str]]:
+        """Returns what other nodes report of their devices, except nodes that don't answer.
+
+        `offset` is how many variables of the first device to skip. Returns also the devices with
+        which a message was full: what follows them must be asked for again.
+        """
         of_process: dict[str, tuple[Holding, list[str]]] = {}
         for device in devices:
             owner = self._fleet.holder(device.partition)
             if owner is not None and self._fleet.is_other(owner):
                 of_process.setdefault(owner.process, (owner, []))[1].append(device.id)
         found = await asyncio.gather(
-            *(self._reports_of(what, *each) for each in of_process.values())
+            *(
+                self._reports_of(what, node, ids, offset if ids[0] == devices[0].id else 0)
+                for node, ids in of_process.values()
+            )
         )
-        return {device: report for each in found for device, report in each.items()}
+        reports = {device: report for each in found for device, report in each.devices.items()}
+        return reports, {list(each.devices)[-1] for each in found if each.is_full and each.devices}
 
-    async def _reports_of(self, what: str, node: Holding, devices: list[str]) -> dict[str, Any]:
+    async def _reports_of(
+        self, what: str, node: Holding, devices: list[str], offset: int
+    ) -> NodeReports:
+        question = ReportQuestion(devices=devices, offset=offset)
         try:
-            return (
-                await self._ask(
-                    node, what, ReportQuestion(devices=devices), NodeReports, ANSWER_TIMEOUT_S
-                )
-            ).devices
+            return await self._ask(node, what, question, NodeReports, ANSWER_TIMEOUT_S)
         except (Error, OSError) as error:
             reason = nats_reason(error)
             log_lines.refused("node_silent", kind="fleet", node=node.node, reason=reason)
-            return {}
+            return NodeReports(devices={})
 
     async def _ask(
         self, node: Holding, what: str, request: msgspec.Struct, kind: type[Reply], seconds: float
@@ -222,15 +236,33 @@ class NodeAnswers:
     async def browse(self, message: Msg) -> bytes:
         """Reports devices that this node polls."""
         question = msgspec.json.decode(message.data, type=ReportQuestion)
-        return self._fitting(self._reports.device_reports(question.devices))
+        encode = msgspec.json.encode
+        texts = (
+            encode(id) + b":" + encode(report)
+            for id, report in self._reports.device_reports(question.devices)
+        )
+        return _answer(*joined(texts, self._reports.max_bytes - ENVELOPE_BYTES))
 
     async def variables(self, message: Msg) -> bytes:
         """Reports the values of devices that this node polls."""
         question = msgspec.json.decode(message.data, type=ReportQuestion)
-        return self._fitting(self._reports.device_variables(question.devices))
+        left = most = self._reports.max_bytes - ENVELOPE_BYTES
+        devices: list[bytes] = []
+        for id, values in self._reports.device_variables(question.devices):
+            head = msgspec.json.encode(id) + b":["
+            around = len(head) + len(b"],")
+            offset = question.offset if id == question.devices[0] else 0
+            texts = (fitting(each, most - around) for each in islice(values, offset, None))
+            text, is_all = joined(texts, left - around)
+            left -= around + len(text)
+            if left < 0 or not (text or is_all):
+                return _answer(b",".join(devices), False)
+            devices.append(head + text + b"]")
+            if not is_all:
+                return _answer(b",".join(devices), False)
+        return _answer(b",".join(devices), True)
 
-    def _fitting(self, reports: Iterable[tuple[str, object]]) -> bytes:
-        """Returns as many reports as fit into a message."""
-        encode, room = msgspec.json.encode, self._reports.max_bytes - ENVELOPE_BYTES
-        texts = (encode(id) + b":" + encode(content) for id, content in reports)
-        return b'{"devices":{' + joined(texts, room)[0] + b"}}"
+
+def _answer(devices: bytes, is_all: bool) -> bytes:
+    """Returns `NodeReports` as JSON."""
+    return b'{"devices":{%b},"is_full":%b}' % (devices, b"false" if is_all else b"true")

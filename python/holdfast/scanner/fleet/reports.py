@@ -7,14 +7,18 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
+from itertools import chain, islice
 from typing import TYPE_CHECKING
 
 import msgspec
 
 from holdfast.scanner.fleet.nodes import ENVELOPE_BYTES
 from holdfast.scanner.messages.types import BrowseRequest, DeviceReport, VariablesRequest
+from holdfast.scanner.reports.variables import fitting
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from nats.aio.msg import Msg
 
     from holdfast.scanner.fleet.nodes import OtherNodes
@@ -44,11 +48,11 @@ class FleetReports:
         offset = request.offset or 0
         page = ids[offset : offset + DEVICES_PER_QUESTION]
         devices = [self._registry.devices[id] for id in page]
-        found = await self._nodes.reports("browse", devices)
+        found, ends = await self._nodes.reports("browse", devices)
         answer = self._own.browsed(msgspec.structs.replace(request, offset=None), page)
         answer.count = len(self._registry.devices)
         shown: list[DeviceReport] = []
-        room = self._own.max_bytes - ENVELOPE_BYTES
+        room = self._own.max_bytes - ENVELOPE_BYTES - len(msgspec.json.encode(answer.service))
         is_page = request.tag_offset is not None or answer.next_tag is not None
         for report in answer.devices:
             if report.device_id in found:
@@ -62,6 +66,8 @@ class FleetReports:
             if room < 0 and shown:
                 break
             shown.append(report)
+            if report.device_id in ends:
+                break
         if answer.next is not None or len(shown) < len(answer.devices):
             answer.next = offset + len(shown)
         elif offset + len(page) < len(ids):
@@ -73,7 +79,7 @@ class FleetReports:
         """Returns the latest values as JSON. Raises `Refused`."""
         request = self._own.request(message, VariablesRequest)
         left, texts = request.offset or 0, list[bytes]()
-        room = self._own.max_bytes - ENVELOPE_BYTES
+        room = most = self._own.max_bytes - ENVELOPE_BYTES
         ids = sorted(self._registry.devices)
         for at in range(0, len(ids), DEVICES_PER_QUESTION):
             page = self._page(ids[at : at + DEVICES_PER_QUESTION], request.device_id)
@@ -82,18 +88,22 @@ class FleetReports:
                 left -= len(page[skipped].tags)
                 skipped += 1
             page = page[skipped:]
-            found = await self._nodes.reports("variables", page)
+            found, ends = await self._nodes.reports("variables", page, left)
             for device in page:
-                values = found.get(device.id)
-                if values is None:
-                    own = self._own.device_variables([device.id])
-                    values = next((each for _, each in own), [])
-                for value in values[left:]:
-                    text = msgspec.json.encode(value)
+                values: Iterable[bytes]
+                if device.id in found:  # Without those that the offset skips.
+                    values = map(msgspec.json.encode, found[device.id])
+                else:
+                    known = self._own.device_variables([device.id])
+                    own = chain.from_iterable(each for _, each in known)
+                    values = (fitting(each, most - 1) for each in islice(own, left, None))
+                for text in values:
                     room -= len(text) + 1
                     if room < 0:
                         return b"[" + b",".join(texts) + b"]"
                     texts.append(text)
+                if device.id in ends:
+                    return b"[" + b",".join(texts) + b"]"
                 left = 0
         return b"[" + b",".join(texts) + b"]"
 

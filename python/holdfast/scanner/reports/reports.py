@@ -91,11 +91,11 @@ class Reports:
         for device in self._known(ids):
             yield device.id, DeviceReporter(device, counters).whole(max_bytes)
 
-    def device_variables(self, ids: Iterable[str]) -> Iterator[tuple[str, list[Variable]]]:
+    def device_variables(self, ids: Iterable[str]) -> Iterator[tuple[str, Iterator[Variable]]]:
         """Yields the latest values of these devices, as far as they are known."""
         for device in self._known(ids):
             tags = device.tags.values()
-            yield device.id, [variable(device, tag, self._settings.prefix) for tag in tags]
+            yield device.id, (variable(device, tag, self._settings.prefix) for tag in tags)
 
     def counts(self) -> Mapping[str, int]:
         """Returns what this scanner has done since its start, for other nodes of a fleet."""
