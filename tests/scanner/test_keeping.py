@@ -17,6 +17,7 @@ from nats.js.kv import KeyValue
 from holdfast.scanner.jetstream import entries, store
 from holdfast.scanner.jetstream.store import BUCKET
 from holdfast.scanner.publish.publishers import Publishers
+from holdfast.scanner.subscriptions.key import SubscriptionKey
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import SMALL_PAYLOAD, Caller, leaving, logged, subscription, tag
@@ -446,3 +447,46 @@ def test_many_requests_at_once_are_all_kept(
 
     assert set(caller.do(ask_all())) == {b'{"success":true,"count":1}'}
     assert len(subscriptions(caller)) == 100
+
+
+def test_a_device_that_gets_another_id_with_the_same_keys_stays_stored() -> None:
+    old, new = SubscriptionKey("pump 1", "hmi"), SubscriptionKey("pump_1", "hmi")
+    key = "modbus.subscription.hmi.pump_1.0"
+    wanted: dict[SubscriptionKey, dict[str, bytes]] = {old: {key: b"old"}}
+    bucket: dict[str, bytes] = {}
+
+    class Bucket:
+        async def put(self, key: str, value: bytes) -> None:
+            bucket[key] = value
+
+    class JetStream:
+        async def purge_stream(self, _name: str, subject: str) -> None:
+            for _ in range(5):  # It is carried out after requests that are sent later.
+                await asyncio.sleep(0)
+            bucket.pop(subject.removeprefix(store.KEY_SUBJECTS), None)
+
+    async def run() -> None:
+        entries = store.EntryStore("modbus", lambda owner: wanted.get(owner, {}), lambda _: {})
+
+        async def write(*owners: SubscriptionKey) -> None:
+            for owner in owners:
+                entries.touch(owner)
+            await entries._write(JetStream(), Bucket())  # type: ignore[arg-type]
+
+        await write(old)
+        assert bucket == {key: b"old"}
+        wanted[new] = {key: b"new"}
+        del wanted[old]
+        await write(old, new)
+        assert bucket == {key: b"new"}
+        await write(old)
+        assert bucket == {key: b"new"}
+        wanted[old] = {key: b"old"}
+        del wanted[new]
+        await write(new, old)
+        assert bucket == {key: b"old"}
+        del wanted[old]
+        await write(old, new)
+        assert bucket == {}
+
+    asyncio.run(run())

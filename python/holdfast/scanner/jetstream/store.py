@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from functools import partial
 from typing import TYPE_CHECKING
 
 from nats.js.errors import NotFoundError
@@ -75,6 +76,8 @@ class EntryStore:
         """Owners of which an entry is too large for the server, and why: it is not stored."""
         self.max_bytes = USUAL_MAX_PAYLOAD_BYTES
         """The size limit of an entry: that of messages."""
+        self._owners: dict[str, SubscriptionKey] = {}
+        """The owners of the stored entries, by key. Two device ids can have the same keys."""
         events = "subscriptions_kept", "subscriptions_not_kept"
         self._availability = Availability(*events, bucket=BUCKET)
         self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
@@ -170,7 +173,7 @@ class EntryStore:
                 found = await reader.fetch_all()
             entries += [(key, each.value) for key, each in found.items() if each is not None]
         owners = self._on_read(entries)
-        self._stored = {}
+        self._stored, self._owners = {}, dict(owners)
         for key, value in entries:
             if key in owners:
                 self._stored.setdefault(owners[key], {})[key] = hash(value)
@@ -183,8 +186,12 @@ class EntryStore:
             count = min(MAX_CONCURRENT_WRITES, len(self._touched))
             self._writing = {self._touched.pop() for _ in range(count)}
             owners = list(self._writing)
-            work = (self._write_owner(jetstream, bucket, owner) for owner in owners)
-            results = await asyncio.gather(*work, return_exceptions=True)
+            # All writes before the first purge: the server may carry out both in any order, and a
+            # purge must not remove what another owner has written under the same key.
+            puts = (self._put(bucket, owner) for owner in owners)
+            wanted = await asyncio.gather(*puts, return_exceptions=True)
+            purges = map(partial(self._purge, jetstream), owners, wanted)
+            results = await asyncio.gather(*purges, return_exceptions=True)
             self._writing = set()
             errors = []
             for owner, result in zip(owners, results, strict=True):
@@ -197,19 +204,35 @@ class EntryStore:
             if errors:
                 raise errors[0]
 
-    async def _write_owner(
-        self, jetstream: JetStreamContext, bucket: KeyValue, owner: SubscriptionKey
-    ) -> None:
+    async def _put(self, bucket: KeyValue, owner: SubscriptionKey) -> Set[str]:
+        """Writes the entries of an owner. Returns their keys."""
         entries = self._without_too_large(owner)
         stored = self._stored.setdefault(owner, {})
         for key, value in entries.items():
-            if stored.get(key) != hash(value):  # A hash: values may take 128 KiB each.
-                await bucket.put(key, value)
-                stored[key] = hash(value)
-        for key in [key for key in stored if key not in entries]:
+            if stored.get(key) == hash(value):  # A hash: values may take 128 KiB each.
+                continue
+            former = self._owners.get(key, owner)
+            if former != owner:  # It must not purge the key any more.
+                self._stored[former].pop(key, None)
+            self._owners[key] = owner
+            stored[key] = hash(value)  # After an error, everything is read again.
+            await bucket.put(key, value)
+        return entries.keys()
+
+    async def _purge(
+        self,
+        jetstream: JetStreamContext,
+        owner: SubscriptionKey,
+        wanted: Set[str] | BaseException,
+    ) -> None:
+        """Removes the other entries of an owner. Raises the error of `_put`."""
+        if isinstance(wanted, BaseException):
+            raise wanted
+        stored = self._stored[owner]
+        for key in [key for key in stored if key not in wanted]:
             # Unlike a deletion, a purge leaves no marker behind.
             await jetstream.purge_stream(STREAM, subject=KEY_SUBJECTS + key)
-            del stored[key]
+            del stored[key], self._owners[key]
         if not stored:
             del self._stored[owner]
 
