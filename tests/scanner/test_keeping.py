@@ -10,14 +10,20 @@ import threading
 from concurrent.futures import Future
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import pytest
 from nats.js import JetStreamContext
 from nats.js.kv import KeyValue
 
-from holdfast.scanner.jetstream import entries, store
+from holdfast.scanner.dialects import TENTACLE
+from holdfast.scanner.jetstream import entries, restore, store
+from holdfast.scanner.jetstream.restore import StoredSubscriptions
 from holdfast.scanner.jetstream.store import BUCKET
+from holdfast.scanner.messages.types import SubscribeRequest, TagRequest
 from holdfast.scanner.publish.publishers import Publishers
 from holdfast.scanner.subscriptions.key import SubscriptionKey
+from holdfast.scanner.subscriptions.registry import Registry
+from holdfast.scanner.subscriptions.request_rules import ScannerLimits
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import SMALL_PAYLOAD, Caller, leaving, logged, subscription, tag
@@ -447,6 +453,256 @@ def test_many_requests_at_once_are_all_kept(
 
     assert set(caller.do(ask_all())) == {b'{"success":true,"count":1}'}
     assert len(subscriptions(caller)) == 100
+
+
+def restart(nats: NatsServer, *options: str) -> tuple[str, ...]:
+    """Starts a server again with other options. Returns the former ones."""
+    nats.kill()
+    former, nats._options = nats._options, options
+    nats.start()
+    return former
+
+
+def tags_by_subscription(caller: Caller) -> dict[tuple[str, str], set[str]]:
+    """Returns the tags of each subscription that is carried out, by device and subscriber."""
+    return {
+        (found["deviceId"], subscriber["id"]): set(subscriber["tagIds"])
+        for found in caller.request("modbus.browse", b"")["devices"]
+        for subscriber in found["subscribers"]
+    }
+
+
+def stored_tags(caller: Caller) -> dict[tuple[str, str], set[str]]:
+    found: dict[tuple[str, str], set[str]] = {}
+    for each in subscriptions(caller).values():
+        owner = each["deviceId"], each["subscriberId"]
+        found.setdefault(owner, set()).update(tag["id"] for tag in each["tags"])
+    return found
+
+
+@pytest.mark.parametrize("reloads", [False, True], ids=["", "reloaded"])
+def test_what_is_requested_before_the_entries_are_read_is_on_top_of_them(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    monkeypatch: pytest.MonkeyPatch,
+    reloads: bool,
+) -> None:
+    monkeypatch.setattr(store, "MAX_RETRY_S", 0.1)
+    ask = own_caller.request
+
+    def add(device: str, *ids: str, **more: Any) -> None:
+        tags = [tag(id, ord(id)) for id in ids]
+        request = subscription(server, *tags, deviceId=device, scanRate=60_000, **more)
+        assert ask("modbus.subscribe", request)["success"]
+
+    def leave(device: str, *ids: str, **more: Any) -> None:
+        assert ask("modbus.unsubscribe", leaving(*ids, deviceId=device, **more))["success"]
+
+    # A reload hands the requests over with all settings.
+    settings: dict[str, int] = {} if reloads else {"timeout": 20_700}
+    devices = "same", "more", "fewer", "ended", "begun anew", "moved", "shared", "untouched"
+    first = run_scanner(own_nats)
+    for each in devices:
+        add(each, "a", "b", **settings)
+    add("shared", "b", "c", subscriberId="historian", **settings)
+    first.stop()
+
+    jetstream = restart(own_nats)
+    scanner = run_scanner(own_nats)
+    add("same", "a", "b", **settings)
+    add("more", "c")
+    leave("fewer", "a")
+    leave("ended", tagIds="all")
+    leave("begun anew", tagIds="all")
+    add("begun anew", "c")
+    add("moved", "c", host="127.0.0.2")
+    leave("shared", "a")
+    add("shared", "d", subscriberId="historian")
+    add("new", "a", "b")
+    leave("new", "a")
+    if reloads:
+        scanner.stop()
+        scanner = run_scanner(own_nats, former=list(scanner.scanner.stored_requests()))
+    restart(own_nats, *jetstream)
+    wanted = {
+        ("same", "hmi"): {"a", "b"},
+        ("more", "hmi"): {"a", "b", "c"},
+        ("fewer", "hmi"): {"b"},
+        ("begun anew", "hmi"): {"c"},
+        ("moved", "hmi"): {"a", "b", "c"},
+        ("shared", "hmi"): {"b"},
+        ("shared", "historian"): {"b", "c", "d"},
+        ("untouched", "hmi"): {"a", "b"},
+        ("new", "hmi"): {"b"},
+    }
+    wire.until(lambda: scanner.serves, "it is connected again")
+    wire.until(lambda: tags_by_subscription(own_caller) == wanted, "they are carried out")
+    wire.until(lambda: stored_tags(own_caller) == wanted, "they are stored")
+    scanner.stop()
+    run_scanner(own_nats)
+    wire.until(lambda: tags_by_subscription(own_caller) == wanted, "they are restored")
+    assert device(own_caller, "moved")["url"].startswith("tcp://127.0.0.2:")
+    if not reloads:
+        assert device(own_caller, "more")["timeout"] == 20_700
+
+
+def test_the_dialect_of_whole_subscriptions_replaces_what_is_not_read_yet(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(store, "MAX_RETRY_S", 0.1)
+    requests = [subscription(server, tag(id, 0), deviceId="d") for id in ("a", "b")]
+    first = run_scanner(own_nats, dialect="tentacle-next")
+    assert own_caller.request("modbus.subscribe", requests[0])["success"]
+    first.stop()
+    jetstream = restart(own_nats)
+    run_scanner(own_nats, dialect="tentacle-next")
+    assert own_caller.request("modbus.subscribe", requests[1])["success"]
+    restart(own_nats, *jetstream)
+    wanted = {("d", "hmi"): {"b"}}
+    wire.until(lambda: stored_tags(own_caller) == wanted, "the new one is stored")
+    assert tags_by_subscription(own_caller) == wanted
+
+
+def test_a_request_adds_tags_to_a_refused_subscription(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(restore, "MAX_RETRY_S", 0.1)
+    first = run_scanner()
+    request = subscription(server, tag("a", 0), tag("b", 1), host="127.0.0.2", timeout=20_700)
+    assert caller.request("modbus.subscribe", request)["success"]
+    first.stop()
+    second = run_scanner(allow=("127.0.0.1/32",))
+    assert tags_by_subscription(caller) == {}
+    request = subscription(server, tag("b", 2), tag("c", 3), host="127.0.0.1")
+    assert caller.request("modbus.subscribe", request)["success"]
+    wanted = {("plc1", "hmi"): {"a", "b", "c"}}
+    assert stored_tags(caller) == wanted
+    wire.until(lambda: tags_by_subscription(caller) == wanted, "all are carried out")
+    found = device(caller, "plc1")
+    assert found["timeout"] == 20_700
+    assert [each["address"] for each in found["tags"] if each["id"] == "b"] == [2]
+    second.stop()
+    run_scanner()
+    assert device(caller, "plc1") == found
+
+
+def test_a_refused_part_of_a_subscription_is_kept_and_does_not_refuse_the_others(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, caplog: pytest.LogCaptureFixture
+) -> None:
+    run_scanner().stop()
+    parts = tag("a", 0), tag("p", 1, profile="gone")
+    for number, part in enumerate(parts):
+        text = json.dumps(subscription(server, part))
+        put(caller, f"modbus.subscription.hmi.plc1.{number}", text.encode())
+    second = run_scanner()
+    assert tags_by_subscription(caller) == {("plc1", "hmi"): {"a"}}
+    assert len(logged(caplog, "not_restored")) == 1
+    assert caller.request("modbus.subscribe", subscription(server, tag("b", 2)))["success"]
+    assert stored_tags(caller) == {("plc1", "hmi"): {"a", "b", "p"}}
+    second.stop()
+    third = run_scanner(former=list(second.scanner.stored_requests()))
+    wanted = {("plc1", "hmi"): {"a", "b"}}
+    wire.until(lambda: tags_by_subscription(caller) == wanted, "what is not refused")
+    wire.until(
+        lambda: stored_tags(caller) == {("plc1", "hmi"): {"a", "b", "p"}}, "it is all stored"
+    )
+    third.stop()
+    run_scanner()
+    assert tags_by_subscription(caller) == wanted
+    assert caller.request("modbus.unsubscribe", leaving("p"))["success"]
+    assert stored_tags(caller) == wanted
+
+
+def test_without_storage_a_request_adds_tags_to_a_refused_subscription_too(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    scanner = run_scanner(keep_subscriptions=False)
+
+    def reload(**more: Any) -> None:
+        nonlocal scanner
+        scanner.stop()
+        former = list(scanner.scanner.stored_requests())
+        scanner = run_scanner(keep_subscriptions=False, former=former, **more)
+
+    request = subscription(server, tag("a", 0), tag("b", 1), host="127.0.0.2")
+    assert caller.request("modbus.subscribe", request)["success"]
+    reload(allow=("127.0.0.1/32",))
+    assert tags_by_subscription(caller) == {}
+    request = subscription(server, tag("c", 3), host="127.0.0.1")
+    assert caller.request("modbus.subscribe", request)["success"]
+    assert caller.request("modbus.unsubscribe", leaving("a"))["success"]
+    reload(allow=("127.0.0.1/32",))
+    assert tags_by_subscription(caller) == {("plc1", "hmi"): {"b", "c"}}
+
+
+def test_what_is_unsubscribed_without_jetstream_stays_so_after_a_reload(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(store, "MAX_RETRY_S", 0.1)
+    scanner = run_scanner(own_nats)
+    for id in ("ended", "fewer"):
+        request = subscription(server, tag("a", 0), tag("b", 1), deviceId=id)
+        assert own_caller.request("modbus.subscribe", request)["success"]
+    jetstream = restart(own_nats)
+    wire.until(lambda: scanner.serves, "it is connected again")
+    for ids, id in (("all", "ended"), (["a"], "fewer")):
+        left = leaving(deviceId=id, tagIds=ids)
+        assert own_caller.request("modbus.unsubscribe", left)["success"]
+    scanner.stop()
+    run_scanner(own_nats, former=list(scanner.scanner.stored_requests()))
+    restart(own_nats, *jetstream)
+    wanted = {("fewer", "hmi"): {"b"}}
+    wire.until(lambda: stored_tags(own_caller) == wanted, "what is left is stored")
+    assert tags_by_subscription(own_caller) == wanted
+
+
+def test_a_pending_subscription_that_a_caller_ends_meanwhile_is_not_carried_out() -> None:
+    owner = SubscriptionKey("plc1", "hmi")
+    carried_out: list[SubscribeRequest] = []
+
+    class Host:
+        def __init__(self) -> None:
+            self._lock = asyncio.Lock()
+            self.waits = asyncio.Event()
+
+        def lock(self, _device: str) -> asyncio.Lock:
+            self.waits.set()
+            return self._lock
+
+        def is_entry(self, _owner: SubscriptionKey) -> bool:
+            return False
+
+        async def restore(self, request: SubscribeRequest) -> None:
+            carried_out.append(request)
+
+    async def run(*, ends: bool) -> None:
+        stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), TENTACLE)
+        stored._device_host = stored._host = host = Host()  # type: ignore[assignment]
+        tags = [TagRequest("a", 0, "holding", "int16")]
+        value = msgspec.json.encode(SubscribeRequest("plc1", "hmi", tags, host="127.0.0.1"))
+        stored._on_read([("modbus.subscription.hmi.plc1.0", value)])
+        async with host.lock("plc1"):
+            host.waits.clear()
+            restoring = asyncio.create_task(stored._restore_all())
+            await asyncio.wait_for(host.waits.wait(), wire.DEADLINE)
+            if ends:
+                stored.unsubscribed(owner.removal())
+        await restoring
+
+    asyncio.run(run(ends=False))
+    assert len(carried_out) == 1
+    asyncio.run(run(ends=True))
+    assert len(carried_out) == 1
 
 
 def test_a_device_that_gets_another_id_with_the_same_keys_stays_stored() -> None:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
     import holdfast
-    from holdfast.scanner.messages.types import SubscribeRequest
+    from holdfast.scanner.messages.types import SubscriptionRequest
 
 Result = TypeVar("Result")
 
@@ -237,7 +237,7 @@ def _bytes(payload: object) -> bytes:
 class Running:
     """A scanner in its own thread."""
 
-    def __init__(self, settings: Settings, former: Iterable[SubscribeRequest] = ()) -> None:
+    def __init__(self, settings: Settings, former: Iterable[SubscriptionRequest] = ()) -> None:
         loop = _Loop()
         self._loop: _Loop | None = loop
         try:
@@ -248,7 +248,7 @@ class Running:
         self.ended = asyncio.run_coroutine_threadsafe(self.scanner.run(), loop.loop)
 
     @staticmethod
-    async def _made(settings: Settings, former: Iterable[SubscribeRequest]) -> Scanner:
+    async def _made(settings: Settings, former: Iterable[SubscriptionRequest]) -> Scanner:
         return Scanner(settings, former=former)
 
     @property

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from holdfast._core import Poller
     from holdfast.replication.leases.thread import StartThread
     from holdfast.runtime.stop import Stop
-    from holdfast.scanner.messages.types import SubscribeRequest
+    from holdfast.scanner.messages.types import SubscriptionRequest
     from holdfast.scanner.settings import Settings
 
 
@@ -36,7 +36,7 @@ class ScannerAdapter:
         settings: Settings,
         poller: Poller | None = None,
         start_thread: StartThread = threading.Thread.start,
-        former: Iterable[SubscribeRequest] = (),
+        former: Iterable[SubscriptionRequest] = (),
     ) -> None:
         self._settings = settings
         self._scanner = Scanner(settings, poller, start_thread, former)

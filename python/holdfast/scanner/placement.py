@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.responder import Handle
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.key import SubscriptionKey
+    from holdfast.scanner.subscriptions.subscription import Subscription
     from holdfast.scanner.subscriptions.tag import Tag
 
 Changed = TypeVar("Changed")
@@ -62,7 +63,7 @@ class SubscriptionHost(Protocol):
         """Whether a subscription is from an entry of a bucket, which keeps it then."""
 
     async def restore(self, request: SubscribeRequest) -> None:
-        """Carries out a stored request. Raises `Refused`."""
+        """Carries out a stored request. The lock of the device is held. Raises `Refused`."""
 
     async def adopt(
         self, device: str, desired: Mapping[str, Sequence[SubscribeRequest]], renewed: set[str]
@@ -153,10 +154,12 @@ class Placement:
     async def close(self) -> None:
         """Removes the states of devices, which would be out of date."""
 
-    def subscribed(self, _device: ScannedDevice, _subscriber: str | None, /) -> None:
+    def subscribed(
+        self, _device: ScannedDevice, _subscription: Subscription, _is_stored: bool, /
+    ) -> None:
         """Notes that a device is known from now on.
 
-        The subscription of `subscriber` must be stored. `None`: it is stored already.
+        The subscription must be stored, unless it is stored already.
         """
 
     def dropped(self, device: ScannedDevice) -> None:
@@ -200,6 +203,13 @@ class Placement:
 
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Notes that tags of a subscription are removed."""
+
+    def removals(self, known: Iterable[SubscriptionKey], /) -> Iterator[UnsubscribeRequest]:
+        """Yields what to remove from stored subscriptions, for the next scanner of this process.
+
+        That scanner gets the `known` subscriptions from this one.
+        """
+        return (owner.removal() for owner in known)
 
     def state_changed(self, device: str) -> None:
         """Notes that the state of a device has changed, or that the device is gone."""

@@ -12,7 +12,7 @@ import msgspec
 from holdfast.events import log_lines
 from holdfast.runtime.text import clip
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.jetstream.entries import is_last, joined, restored, without
+from holdfast.scanner.jetstream.entries import is_last, joined, restored, with_later, without
 from holdfast.scanner.jetstream.entries import requests as stored_requests
 from holdfast.scanner.jetstream.entry_subscriptions import check_entry
 from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
@@ -126,7 +126,7 @@ class Requests:
                 self._devices.keep_only(
                     subscription.device, subscription.subscriber, subscription.tags
                 )
-        self.former.pop(subscription.key, None)
+            self._renew_former(subscription)
         # Outside the lock: storing can take seconds, and other requests need not wait for it.
         unstored = await self._placement.settled(subscription.key)
         self._log.adjusted(subscription.subscriber, subscription.device, adjustments)
@@ -136,6 +136,18 @@ class Requests:
             return Answer(success=False, error=f"subscribed, but not kept: {unstored}")
         count = len(request.tags) if request.profile is None else len(subscription.tags)
         return Answer(success=True, count=count)
+
+    def _renew_former(self, subscription: Subscription) -> None:
+        """Adds a new request to the refused ones of its subscriber, which keep their tags."""
+        former = self.former.pop(subscription.key, [])
+        device = self._registry.devices.get(subscription.device)
+        if self._rules.dialect.replaces_subscription or not former:
+            return
+        if device is not None and subscription.subscriber in device.subscribers:
+            given = subscription.given_settings
+            former = with_later(former, device, subscription.subscriber, given)
+        if former:
+            self.former[subscription.key] = former
 
     async def unsubscribe(self, message: Msg) -> Answer:
         """Removes tags of a subscription. Raises `Refused`."""
@@ -196,6 +208,7 @@ class Requests:
                 ttls.renew(subscription, RETRY_EXPIRY_S)
                 return
         if has_ended:
+            self.former.pop(subscription, None)
             log_lines.write(logging.INFO, "expired", **subscription.fields)
 
     def is_entry(self, subscription: SubscriptionKey) -> bool:
@@ -229,11 +242,13 @@ class Requests:
         self._log.unsubscribed(request)
 
     async def restore(self, request: SubscribeRequest) -> None:
-        """Carries out a stored request, unless an entry has replaced it. Raises `Refused`."""
-        if self.is_entry(SubscriptionKey.of(request)):
-            return
-        async with self._devices.lock(request.device_id):
+        """Carries out a stored request, unless an entry has replaced it. Raises `Refused`.
+
+        The lock of the device is held.
+        """
+        if not self.is_entry(SubscriptionKey.of(request)):
             await self._add_stored(request, is_stored=True)
+            self.former.pop(SubscriptionKey.of(request), None)
 
     async def _add_stored(
         self, request: SubscribeRequest, *, is_stored: bool = False, renewed: bool = True

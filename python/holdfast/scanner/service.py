@@ -6,7 +6,7 @@ import asyncio
 import logging
 import threading
 import time
-from itertools import chain
+from itertools import chain, groupby
 from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
@@ -19,6 +19,7 @@ from holdfast.scanner.fleet.placement import FleetPlacement
 from holdfast.scanner.jetstream.buckets import Buckets, TentacleNextBuckets
 from holdfast.scanner.jetstream.entries import is_last, joined, requests, restored
 from holdfast.scanner.jetstream.restore import StoredSubscriptions
+from holdfast.scanner.messages.types import UnsubscribeRequest
 from holdfast.scanner.placement import Placement
 from holdfast.scanner.polling import device_tls
 from holdfast.scanner.polling.allowed_devices import AllowedDevices
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from holdfast.net.nats.connection import Handler
     from holdfast.net.nats.tolerant_client import SafeClient
     from holdfast.replication.leases.thread import StartThread
-    from holdfast.scanner.messages.types import SubscribeRequest
+    from holdfast.scanner.messages.types import SubscribeRequest, SubscriptionRequest
     from holdfast.scanner.settings import Settings
 
 STOP_STEP_TIMEOUT_S = 2.0
@@ -62,7 +63,7 @@ class Scanner:
         settings: Settings,
         poller: Poller | None = None,
         start_thread: StartThread = threading.Thread.start,
-        former: Iterable[SubscribeRequest] = (),
+        former: Iterable[SubscriptionRequest] = (),
     ) -> None:
         """Without `poller`, it has a poller of its own. `start_thread` is for leases.
 
@@ -174,31 +175,57 @@ class Scanner:
         former, self.former = self.former, ()
         if self._settings.fleet is not None:
             return  # A fleet has stored all of them.
-        parts: dict[SubscriptionKey, list[SubscribeRequest]] = {}
+        removals: list[UnsubscribeRequest] = []
+        added: list[SubscribeRequest] = []
         for request in former:
-            parts.setdefault(SubscriptionKey.of(request), []).append(request)
-        former = map(joined, sorted(parts.values(), key=is_last))
-        await asyncio.gather(*map(self._restore, former))
+            if isinstance(request, UnsubscribeRequest):
+                removals.append(request)
+            else:
+                added.append(request)
+        # What was refused of a subscription is not joined with what was carried out of it.
+        parts = (list(group) for _, group in groupby(added, key=SubscriptionKey.of))
+        wholes = [*map(joined, sorted(parts, key=is_last))]
+        outcomes = await asyncio.gather(*map(self._restore, wholes))
+        refused = [whole for whole, ok in zip(wholes, outcomes, strict=True) if not ok]
+        for whole in refused:
+            if whole.ttl is None:  # Else its subscriber repeats it.
+                owner = SubscriptionKey.of(whole)
+                self._requests.former.setdefault(owner, []).append(whole)
+        stays = {SubscriptionKey.of(whole) for whole in refused}
+        for removal in removals:
+            # A refused subscription stays as it is stored: it is tried again.
+            if removal.ids is not None or SubscriptionKey.of(removal) not in stays:
+                self._placement.unsubscribed(removal)
 
-    async def _restore(self, request: SubscribeRequest) -> None:
+    async def _restore(self, request: SubscribeRequest) -> bool:
+        """Carries out a request of a former scanner. Returns whether it was accepted."""
         owner = SubscriptionKey.of(request)
         try:
-            await self._requests.restore(request)
+            async with self._devices.lock(request.device_id):
+                await self._requests.restore(request)
         except Refused as refused:
             log_lines.write(logging.WARNING, "not_restored", **owner.fields, reason=str(refused))
             self._devices.give_up(request.device_id, str(refused))
-            if request.ttl is None:  # Else its subscriber repeats it.
-                self._requests.former.setdefault(owner, []).append(request)
-        else:
-            log_lines.write(logging.INFO, "restored", **owner.fields, tags=len(request.tags))
+            return False
+        log_lines.write(logging.INFO, "restored", **owner.fields, tags=len(request.tags))
+        return True
 
-    def stored_requests(self) -> Iterator[SubscribeRequest]:
-        """Yields requests that make the subscriptions, except those from entries of a bucket."""
+    def stored_requests(self) -> Iterator[SubscriptionRequest]:
+        """Yields requests that make the subscriptions, except those from entries of a bucket.
+
+        Requests before them remove what is stored and out of date.
+        """
         yield from self.former
-        for device in self._registry.devices.values():
-            for subscriber in device.subscribers:
-                if not self._requests.is_entry(SubscriptionKey(device.id, subscriber)):
-                    yield from map(restored, requests(device, subscriber))
+        known = [
+            (owner, device)
+            for device in self._registry.devices.values()
+            for owner in (SubscriptionKey(device.id, name) for name in device.subscribers)
+            if not self._requests.is_entry(owner)
+        ]
+        yield from self._placement.removals(owner for owner, _ in known)
+        for owner, device in known:
+            assert owner.subscriber is not None
+            yield from map(restored, requests(device, owner.subscriber))
         # Last: a refused one must not displace one that is carried out.
         yield from chain.from_iterable(self._requests.former.values())
 
@@ -297,7 +324,7 @@ def _placement(settings: Settings, registry: Registry, start_thread: StartThread
     if settings.fleet is not None:
         return FleetPlacement(settings, settings.fleet, registry, start_thread)
     if settings.keep_subscriptions:
-        return StoredSubscriptions(settings.prefix, registry)
+        return StoredSubscriptions(settings.prefix, registry, DIALECTS[settings.dialect])
     return Placement()
 
 

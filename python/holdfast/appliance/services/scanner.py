@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.services import NatsConfig
     from holdfast.config.models.tags import ProfileConfig
     from holdfast.scanner.adapter import ScannerAdapter
-    from holdfast.scanner.messages.types import SubscribeRequest
+    from holdfast.scanner.messages.types import SubscriptionRequest
     from holdfast.scanner.settings import Settings
 
 
@@ -38,7 +38,7 @@ class ScannerService(Service):
         starter, poller = Starter(), running.context.devices.poller
 
         def adapter() -> ScannerAdapter:
-            former: list[SubscribeRequest] = []
+            former: list[SubscriptionRequest] = []
             if self._former is not None:
                 before, of = self._former
                 if _clients(of) == _clients(settings):

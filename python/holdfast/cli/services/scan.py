@@ -73,7 +73,7 @@ if TYPE_CHECKING:
 
     from holdfast.net.allow_list import AllowEntry
     from holdfast.net.tls import Tls
-    from holdfast.scanner.messages.types import SubscribeRequest
+    from holdfast.scanner.messages.types import SubscriptionRequest
 
 
 class _Timeout(Duration):
@@ -227,7 +227,7 @@ async def _serve(settings: Settings, check: Callable[[], None] | None) -> None:
     signals = Signals(reload="with a terminal")
     log_lines.write(logging.INFO, "started", version=__version__)
     freeze_garbage_collector()
-    former: Iterable[SubscribeRequest] | None = ()
+    former: Iterable[SubscriptionRequest] | None = ()
     while former is not None:
         former = await _scan(settings, check, signals, former)
     log_lines.tell_held_back(all_of_them=True)
@@ -238,8 +238,8 @@ async def _scan(
     settings: Settings,
     check: Callable[[], None] | None,
     signals: Signals,
-    former: Iterable[SubscribeRequest],
-) -> Iterable[SubscribeRequest] | None:
+    former: Iterable[SubscriptionRequest],
+) -> Iterable[SubscriptionRequest] | None:
     """Runs a scanner with the subscriptions of a former one.
 
     Returns its own if it ended because of files that have changed.

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.settings import FleetSettings
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
+    from holdfast.scanner.subscriptions.subscription import Subscription
 
 ADOPT_RETRY_S = 10.0
 """Between attempts to carry out a subscription of another node that is refused here."""
@@ -344,7 +345,9 @@ class FleetMember(Placement):
                 "use fewer tags, or set max_payload of the NATS server"
             )
 
-    def subscribed(self, device: ScannedDevice, _subscriber: str | None, /) -> None:
+    def subscribed(
+        self, device: ScannedDevice, _subscription: Subscription, _is_stored: bool, /
+    ) -> None:
         """A device is known from now on. `store` stores its subscriptions."""
         device.partition = partition_of(
             connection_of(device.source.target), self.fleet.settings.partitions

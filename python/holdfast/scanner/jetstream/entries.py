@@ -16,6 +16,7 @@ from holdfast.scanner.messages.decoding import decode
 from holdfast.scanner.messages.subject_parts import subject_id
 from holdfast.scanner.messages.types import MAX_DESCRIPTION, SubscribeRequest, TagRequest
 from holdfast.scanner.subscriptions.device import NO_OPTIONS, TagOptions
+from holdfast.scanner.subscriptions.subscription import SETTINGS
 from holdfast.scanner.subscriptions.tag import CODE_OF_AREA
 
 if TYPE_CHECKING:
@@ -135,6 +136,41 @@ def without(found: Iterable[SubscribeRequest], ids: Collection[str]) -> list[Sub
         for each in parts
     )
     return [each for each in left if each.tags]
+
+
+def with_later(
+    parts: Sequence[SubscribeRequest],
+    device: ScannedDevice,
+    subscriber: str,
+    given: Collection[str],
+) -> list[SubscribeRequest]:
+    """Returns stored requests together with the later ones of a known subscriber.
+
+    The later ones replace tags and settings; of `SETTINGS`, only those that are `given`, unless the
+    device has other subscribers. Returns nothing if the stored requests add nothing.
+    """
+    later = [restored(value) for value in requests(device, subscriber)]
+    ids = {tag.id for each in later for tag in each.tags}
+    earlier = [[tag for tag in _ordered(each) if tag.id not in ids] for each in parts]
+    profiles = (each.profile for each in (later[0], *parts))
+    changes: dict[str, Any] = {"profile": next(filter(None, profiles), None)}
+    if len(device.subscribers) == 1:
+        for key in SETTINGS:
+            if key not in given and (value := getattr(parts[0], key)) is not None:
+                changes[key] = value
+    head = msgspec.structs.replace(later[0], **changes)
+    if head == later[0] and not any(earlier):
+        return []
+    tags = filter(None, [*earlier, *(each.tags for each in later)])
+    return [msgspec.structs.replace(head, tags=each) for each in tags]
+
+
+def _ordered(request: SubscribeRequest) -> list[TagRequest]:
+    """Returns the tags of a request, each with its byte order."""
+    order = request.byte_order
+    return [
+        msgspec.structs.replace(tag, byte_order=tag.byte_order or order) for tag in request.tags
+    ]
 
 
 def is_last(parts: Iterable[SubscribeRequest]) -> bool:

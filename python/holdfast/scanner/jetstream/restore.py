@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -21,6 +22,7 @@ from holdfast.scanner.jetstream.entries import (
     requests,
     restored,
     status_key,
+    with_later,
     without,
 )
 from holdfast.scanner.jetstream.store import EntryStore
@@ -29,27 +31,58 @@ from holdfast.scanner.placement import Placement
 from holdfast.scanner.subscriptions.key import SubscriptionKey
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Iterable, Iterator, Mapping
 
     from nats.aio.client import Client
 
+    from holdfast.scanner.dialects import Dialect
     from holdfast.scanner.messages.types import SubscribeRequest, UnsubscribeRequest
     from holdfast.scanner.placement import DeviceHost, SubscriptionHost
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
+    from holdfast.scanner.subscriptions.subscription import Subscription
+
+MAX_REMOVED_IDS = 10_000
+"""Limit of remembered ids of tags that a subscriber has removed: a device has no more."""
 
 MAX_RESTORE_WAIT_S = 2.0
 """How long requests wait for stored subscriptions. After that, restoring continues."""
 
 
+@dataclass(slots=True)
+class Changes:
+    """What a subscriber changes before its stored subscription is read.
+
+    Without JetStream, it is never read. So the requests are not kept here: the registry has what
+    they add.
+    """
+
+    replaces: bool = False
+    """Whether nothing of the stored subscription is left."""
+    removed: set[str] = field(default_factory=set)
+    """The ids of removed tags."""
+    given: set[str] = field(default_factory=set)
+    """The `SETTINGS` that its requests contain."""
+
+    def remove(self, ids: Collection[str] | None) -> None:
+        """Removes tags; `None` for all."""
+        if ids is None:
+            self.replaces = True
+        elif len(self.removed) < MAX_REMOVED_IDS:
+            self.removed.update(ids)
+
+
 class StoredSubscriptions(Placement):
     """Stores the subscriptions and states of the registry, and restores them after a start."""
 
-    def __init__(self, prefix: str, registry: Registry) -> None:
+    def __init__(self, prefix: str, registry: Registry, dialect: Dialect) -> None:
         self._prefix = prefix
         self._registry = registry
+        self._dialect = dialect
+        self._changes: dict[SubscriptionKey, Changes] = {}
+        """What subscribers change before the stored requests are read."""
         self._pending: dict[SubscriptionKey, list[SubscribeRequest]] = {}
-        """Stored requests that are not carried out yet."""
+        """Stored requests that are not carried out yet, and the later ones of their subscribers."""
         self._logged: set[SubscriptionKey] = set()
         """Pending subscriptions whose refusal is logged."""
         self._has_read = False
@@ -78,10 +111,23 @@ class StoredSubscriptions(Placement):
         with contextlib.suppress(Exception):  # JetStream is optional, and may fail in any way.
             await self._store.stop()
 
-    def subscribed(self, device: ScannedDevice, subscriber: str | None, /) -> None:
-        """Stores a subscription that has changed, instead of what is pending."""
-        if subscriber is not None:
-            self._touch(SubscriptionKey(device.id, subscriber))
+    def subscribed(
+        self, device: ScannedDevice, subscription: Subscription, is_stored: bool, /
+    ) -> None:
+        """Stores a subscription that has changed, together with what is pending of it."""
+        owner, given = subscription.key, subscription.given_settings
+        if not self._has_read:
+            changes = self._changes.setdefault(owner, Changes())
+            changes.given |= given
+            changes.replaces |= self._dialect.replaces_subscription
+        if is_stored:
+            return
+        pending = [] if self._dialect.replaces_subscription else self._pending.get(owner, [])
+        if pending and (pending := with_later(pending, device, subscription.subscriber, given)):
+            self._pending[owner] = pending
+            self._store.touch(owner)
+        else:
+            self._touch(owner)
 
     def state_changed(self, device: str) -> None:
         """Stores the state of a device; removes it if the device is gone."""
@@ -91,10 +137,21 @@ class StoredSubscriptions(Placement):
         """Removes tags of a subscription, also of a pending one."""
         owner = SubscriptionKey.of(request)
         ids = request.ids
+        if not self._has_read:
+            self._changes.setdefault(owner, Changes()).remove(ids)
         left = [] if ids is None else without(self._pending.get(owner, []), set(ids))
         self._touch(owner)
         if left:
             self._pending[owner] = left
+
+    def removals(self, known: Iterable[SubscriptionKey], /) -> Iterator[UnsubscribeRequest]:
+        """Yields what to remove from stored subscriptions, for the next scanner of this process."""
+        if not self._has_read:
+            for owner, changes in self._changes.items():
+                yield owner.removal(None if changes.replaces else list(changes.removed))
+            return
+        touched = {owner for owner in self._store.touched if owner.subscriber is not None}
+        yield from super().removals((touched | {*known}) - self._pending.keys())
 
     async def settled(self, subscription: SubscriptionKey, /) -> str | None:
         """Waits until a changed subscription is stored; not while JetStream fails."""
@@ -131,6 +188,7 @@ class StoredSubscriptions(Placement):
         them.
         """
         owners: dict[str, SubscriptionKey] = {}
+        found: dict[SubscriptionKey, list[SubscribeRequest]] = {}
         for key, value in sorted(entries, key=lambda entry: number(entry[0])):
             try:
                 if key.startswith(f"{self._prefix}.status."):
@@ -142,19 +200,36 @@ class StoredSubscriptions(Placement):
                 log_lines.refused("kept_entry_malformed", kind="kept", key=key, reason=reason)
                 continue
             owner = SubscriptionKey.of(request)
+            found.setdefault(owner, []).append(request)
             is_ours = owner in self._store.touched or self._is_known(owner)
-            if not self._has_read and not is_ours:
-                self._pending.setdefault(owner, []).append(request)
             # An owner that is returned replaces or removes what is stored under its keys.
-            if is_ours or owner in self._pending:
+            if is_ours or owner in self._pending or not self._has_read:
                 owners[key] = owner
-        self._has_read = True
+        if not self._has_read:
+            left = {owner: self._left(owner, parts) for owner, parts in found.items()}
+            self._pending = {owner: parts for owner, parts in left.items() if parts}
+            self._changes.clear()
+            self._has_read = True
         for device in self._registry.devices.values():
             for name in (None, *device.subscribers):
                 self._store.touch(SubscriptionKey(device.id, name))
         if self._pending:
             self._found_pending.set()
         return owners
+
+    def _left(
+        self, owner: SubscriptionKey, parts: list[SubscribeRequest]
+    ) -> list[SubscribeRequest]:
+        """Returns what to carry out of stored requests, with the later ones of their subscriber."""
+        changes = self._changes.get(owner, Changes())
+        left = [] if changes.replaces else parts
+        if changes.removed:
+            left = without(left, changes.removed)
+        if left and self._is_known(owner):
+            assert owner.subscriber is not None
+            device = self._registry.devices[owner.device]
+            left = with_later(left, device, owner.subscriber, changes.given)
+        return left
 
     def _is_known(self, owner: SubscriptionKey) -> bool:
         device = self._registry.devices.get(owner.device)
@@ -184,21 +259,35 @@ class StoredSubscriptions(Placement):
         await asyncio.gather(*map(self._restore_device, devices.values()))
 
     async def _restore_device(self, owners: list[SubscriptionKey]) -> None:
-        pending = [(owner, self._pending.get(owner, [])) for owner in owners]
-        for owner, found in sorted(pending, key=lambda each: is_last(each[1])):
-            if not found or self._pending.get(owner) is not found:
-                continue  # A caller has changed it.
-            try:
-                await self._host.restore(joined(found))
-            except Refused as refused:
-                if owner not in self._logged:
-                    self._logged.add(owner)
-                    log_lines.write(
-                        logging.WARNING, "not_restored", **owner.fields, reason=str(refused)
-                    )
-                    self._device_host.give_up(owner.device, str(refused))
-                continue
-            if self._pending.get(owner) is found:
-                self._touch(owner)
-                tags = sum(len(request.tags) for request in found)
-                log_lines.write(logging.INFO, "restored", **owner.fields, tags=tags)
+        # Known subscribers first: they decide on the settings that all subscribers must share.
+        pending = [(is_last(self._pending.get(owner, [])), owner) for owner in owners]
+        for _, owner in sorted(pending, key=lambda each: (each[0], not self._is_known(each[1]))):
+            # Under the lock: a caller may change or end the subscription while this waits for it.
+            async with self._device_host.lock(owner.device):
+                if found := self._pending.get(owner):
+                    await self._restore_one(owner, found)
+
+    async def _restore_one(self, owner: SubscriptionKey, found: list[SubscribeRequest]) -> None:
+        try:
+            await self._host.restore(joined(found))
+        except Refused as refused:
+            if owner in self._logged:
+                return
+            self._logged.add(owner)
+            await self._restore_parts(owner, found)
+            log_lines.write(logging.WARNING, "not_restored", **owner.fields, reason=str(refused))
+            self._device_host.give_up(owner.device, str(refused))
+        else:
+            self._touch(owner)
+            tags = sum(len(request.tags) for request in found)
+            log_lines.write(logging.INFO, "restored", **owner.fields, tags=tags)
+
+    async def _restore_parts(self, owner: SubscriptionKey, found: list[SubscribeRequest]) -> None:
+        """Carries out the parts of a refused subscription that are not refused alone.
+
+        Before the restart, they may have been carried out by later requests.
+        """
+        if len(found) > 1 and not self._is_known(owner):
+            for part in found:  # Without its profile, which would add the tags of other parts.
+                with contextlib.suppress(Refused):
+                    await self._host.restore(msgspec.structs.replace(part, profile=None))

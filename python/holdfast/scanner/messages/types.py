@@ -6,7 +6,7 @@ scanner are in other modules.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 import msgspec
 from msgspec import Meta
@@ -127,6 +127,9 @@ class UnsubscribeRequest(Request):
     def ids(self) -> list[str] | None:
         """The ids of the tags; `None` for all of the subscriber."""
         return None if self.tag_ids == "all" else self.tag_ids
+
+
+SubscriptionRequest: TypeAlias = SubscribeRequest | UnsubscribeRequest
 
 
 class BrowseRequest(Request):

@@ -82,7 +82,7 @@ class Devices:
         if change.former is not None:
             self._drop(change.former)
         device.endpoint = endpoint
-        self._placement.subscribed(device, None if is_stored else subscription.subscriber)
+        self._placement.subscribed(device, subscription, is_stored)
         is_own = self._placement.is_own(device)
         # Where another node polls the device, `begin` makes all of its tags fresh.
         self._publishers.update(device, change.fresh if is_own else ())

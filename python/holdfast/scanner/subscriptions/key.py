@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from holdfast.scanner.messages.types import UnsubscribeRequest
+
 if TYPE_CHECKING:
-    from holdfast.scanner.messages.types import SubscribeRequest, UnsubscribeRequest
+    from holdfast.scanner.messages.types import SubscriptionRequest
 
 
 @dataclass(frozen=True)
@@ -18,9 +20,14 @@ class SubscriptionKey:
     """`None` for the status of the device, which is stored beside its subscriptions."""
 
     @staticmethod
-    def of(request: SubscribeRequest | UnsubscribeRequest) -> SubscriptionKey:
+    def of(request: SubscriptionRequest) -> SubscriptionKey:
         """Returns the subscription of a request."""
         return SubscriptionKey(request.device_id, request.subscriber_id)
+
+    def removal(self, ids: list[str] | None = None) -> UnsubscribeRequest:
+        """Returns the request that removes tags; without `ids`, all of them."""
+        assert self.subscriber is not None
+        return UnsubscribeRequest(self.device, self.subscriber, ids)
 
     @property
     def fields(self) -> dict[str, str | None]:
