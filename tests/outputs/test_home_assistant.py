@@ -279,6 +279,19 @@ def test_removed_entities_disappear_with_a_reload(plant: Plant) -> None:
     assert len(configs(plant)) == 3 + DIAGNOSTICS
 
 
+@pytest.mark.parametrize("after", [{"discovery": "homeassistant", "discovery_prefix": "ha"}, {}])
+def test_a_reload_with_another_prefix_or_without_discovery_removes_all_entities(
+    plant: Plant, after: dict[str, str]
+) -> None:
+    plant.device()
+    probe = plant.probe("#")
+    appliance = plant.run(discovery="homeassistant")
+    probe.until("plant/holdfast/status/pump", "online")
+    assert configs(plant)
+    appliance.reload(plant.config(after))
+    wire.until(lambda: not configs(plant), "all are removed")
+
+
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
 def test_entities_that_were_removed_while_it_was_stopped_disappear(
     plant: Plant, version: str

@@ -149,20 +149,19 @@ class MqttOutput(BrokerReceiver):
             self._taken, self._messages = [], ()
             self._payloads.keep_only(names)
         self._tags = names
+        before = self._entities
+        if self._discovery is not None:
+            self._entities = self._discovery.entities(tags, self._site.devices())
         self._removal = self._publish(session, self._gone())
         self._availability.keep(names.keys())
         if self._discovery is None:
             return
-        if not self._entities:
+        if not before:
             session.subscribe([self._discovery.birth_topic], retained=False)
-        before, self._entities = (
-            self._entities,
-            self._discovery.entities(tags, self._site.devices()),
-        )
         changed = {
             topic: entity for topic, entity in self._entities.items() if before.get(topic) != entity
         }
-        self._publish(session, {**dict.fromkeys(before.keys() - self._entities, b""), **changed})
+        self._publish(session, changed)
         if not before:
             session.subscribe([self._discovery.filter], retained=True)
 
@@ -170,12 +169,15 @@ class MqttOutput(BrokerReceiver):
         """Messages that remove what this output, or the one before it, has published and does not
         publish any more. Another output may do so now: that topic stays.
         """
-        retained, wanted = self._site.retained, self._topics_of(self._tags)
+        retained, own = self._site.retained, (self._broker, self._name)
+        # In this order, so that values of a tag end before its entity.
+        wanted = dict.fromkeys([*self._topics_of(self._tags), *self._entities])
         for topic in wanted:
             retained[self._broker, topic] = self._name
         known = [*retained.items()]  # A copy, because other outputs change it at any time.
-        own = {topic for (at, topic), name in known if (at, name) == (self._broker, self._name)}
-        return dict.fromkeys(own - wanted, b"")
+        return {
+            topic: b"" for (at, topic), name in known if (at, name) == own and topic not in wanted
+        }
 
     def _forget_removed(self) -> None:
         """Forgets topics once the broker has confirmed that they are removed."""
