@@ -1328,14 +1328,14 @@ class PolledDevice:
     request, of a register or 16 bits) selects the gaps that are read; `readable` and `forbidden`
     are areas with start and end, exclusive. `status` is the memory of the status block, and the
     block. `start_within` is the maximum delay of the first poll (default: the interval, at most 10
-    s). `receiver` takes the polls; `fields` are areas, addresses and counts that are read only for
-    it, and not forwarded. `release` closes the connection after each poll. With `measured`,
-    measurements replace `cost` after a while. `retry` are the first and the longest pause after
-    failures (default: `RETRY_PAUSES_S`). With `jitter`, they are up to a quarter shorter, and the
-    device is retried at the next time of its schedule; without, when they end. With a `fence`, the
-    device is
-    polled and written to while that is open; devices of one link have the same. Times are in
-    seconds; interval 0 polls without a pause.
+    s). `receiver` takes the polls, in which the device is named `reported_as` (default: its name);
+    `fields` are areas, addresses and counts that are read only for it, and not forwarded. `release`
+    closes the connection after each poll. With `measured`, measurements replace `cost` after a
+    while. `retry` are the first and the longest pause after failures (default: `RETRY_PAUSES_S`).
+    With `jitter`, they are up to a quarter shorter, and the device is retried at the next time of
+    its schedule; without, when they end. With a `fence`, the device is polled and written to while
+    that is open; devices of one link have the same. Times are in seconds; interval 0 polls without
+    a pause.
     """
 
     def __new__(
@@ -1358,6 +1358,7 @@ class PolledDevice:
         start_within: float | None = None,
         in_flight: int | None = 1,
         receiver: PollReceiver | None = None,
+        reported_as: str | None = None,
         fields: Sequence[tuple[Area, int, int]] | None = None,
         release: bool = False,
         measured: bool = False,

@@ -30,6 +30,7 @@ from support.running import endpoint
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from holdfast.config import Config
     from support.running import Serve
 
 METER = {
@@ -348,56 +349,117 @@ class Polls:
             return [], []
 
 
-def test_a_poll_of_a_device_that_was_replaced_is_not_of_the_new_one(tmp_path: Path) -> None:
-    polls: Any = Polls()
-    found = TagValues(polls, time.monotonic())
-
-    def poll(start: float, value: int) -> None:
-        registers = value.to_bytes(2, "big") + bytes(10)
-        blocks = [("holding_registers", 0, 6, registers, 0, 0.0), ("coils", 0, 1, b"\0", 0, 0.0)]
-        polls.waiting.put(([("m", start, blocks)], []))
-
-    def power() -> list[Any]:
-        return [each.value for each in found.latest() if each.tag.name == "power"]
-
-    config = load(saved(tmp_path, settings(502)))
-    found.adopt(config)
-    found.start()
-    try:
-        poll(0.0, 10)
-        wire.until(lambda: power() == [1.0], "the first")
-        found.adopt(config, {"m"})
-        poll(1e9, 20)  # Between both, nobody knows whose it is.
-        wire.until(polls.waiting.empty, "it was taken")
-        empty = polls.empty
-        # It may have been taken together with one that was not there: then it is still used.
-        wire.until(lambda: polls.empty > empty + 1, "it was used")
-        found.have_begun({"m"})
-        poll(0.0, 30)
-        poll(1e9, 40)
-        wire.until(lambda: power() not in ([1.0], []), "the new one")
-        assert power() == [4.0]
-    finally:
-        polls.waiting.put(None)
-        found.join(wire.DEADLINE)
+def adopt(values: TagValues, config: Config) -> dict[str, str]:
+    """Takes over a configuration in which all may differ. Returns the names in polls."""
+    tagged = values.tagged(config, config.devices)
+    values.adopt(config, tagged)
+    return {name: each.reported_as for name, each in tagged.items()}
 
 
-def test_a_device_has_its_tags_since_the_reload_that_changed_them(
+def registers(power: int = 0) -> list[Any]:
+    """The blocks of a poll."""
+    words = power.to_bytes(2, "big") + bytes(10)
+    return [("holding_registers", 0, 6, words, 0, 0.0), ("coils", 0, 1, b"\0", 0, 0.0)]
+
+
+def power(values: TagValues) -> list[Any]:
+    return [each.value for each in values.latest() if each.tag.name == "power"]
+
+
+@pytest.mark.parametrize("change", [{"url": "tcp://127.0.0.1:503"}, {"unit": 2}])
+def test_polls_of_the_machine_before_a_reload_are_not_of_the_new_one(
+    tmp_path: Path, change: dict[str, Any]
+) -> None:
+    made = settings(502)
+    made["outputs"]["out"]["publish"] = "change"
+    found = TagValues(cast("Any", Polls()))
+    before = adopt(found, load(saved(tmp_path, made)))["m"]
+    found._handle(deque([(before, 0.0, registers(10))]))
+    assert power(found) == [1.0]
+    made["devices"]["m"] |= change
+    now = adopt(found, load(saved(tmp_path, made)))["m"]
+    assert found.latest() == []
+    buffer = found._outputs["out"].buffer
+    waiting = len(buffer)
+    # The first poll of the new machine may come before the late one.
+    for reported_as, value in ((now, 10), (before, 20)):
+        found._handle(deque([(reported_as, 0.0, registers(value))]))
+    assert power(found) == [1.0]
+    assert len(buffer) == waiting + 4, "the same values, of another machine"
+
+
+def test_a_poll_under_way_counts_if_a_reload_changes_only_other_settings(tmp_path: Path) -> None:
+    made = settings(502)
+    found = TagValues(cast("Any", Polls()))
+    name = adopt(found, load(saved(tmp_path, made)))["m"]
+    made["devices"]["m"]["timeout"] = 0.5
+    assert adopt(found, load(saved(tmp_path, made))) == {"m": name}
+    found._handle(deque([(name, 0.0, registers(10))]))
+    assert power(found) == [1.0]
+
+
+def test_a_reload_keeps_the_values_of_tags_that_stay(tmp_path: Path) -> None:
+    made = settings(502)
+    found = TagValues(cast("Any", Polls()))
+    before = adopt(found, load(saved(tmp_path, made)))["m"]
+    found._handle(deque([(before, 0.0, registers(10))]))
+    changed = {"on": {"area": "coils", "address": 1}, "new": {"area": "coils", "address": 2}}
+    made["profiles"] = {"meter": {"tags": METER["tags"] | changed}}
+    adopt(found, load(saved(tmp_path, made)))
+    assert {each.name for each in found.latest()} == {"power", "label", "phases"}
+    # It does not have the new tags.
+    found._handle(deque([(before, 0.0, registers(20))]))
+    assert power(found) == [1.0]
+    adopt(found, load(saved(tmp_path, settings(502, devices={}))))
+    assert found.latest() == []
+
+
+@pytest.mark.parametrize("is_moved", [False, True])
+def test_after_a_reload_a_device_is_read_at_once(
+    tmp_path: Path, device: int, serve: Serve, is_moved: bool
+) -> None:
+    """Also if it is read only once an hour: with another address, or with another tag."""
+    made = settings(device)
+    made["devices"]["m"]["interval"] = 3600
+    made["outputs"]["out"]["publish"] = "change"
+    with Appliance(load(saved(tmp_path, made))) as appliance:
+        wire.until(lambda: len(rows(tmp_path)) == 4, "all values are there")
+        if is_moved:
+            other = holdfast.Memory(holding_registers=10, coils=8)
+            other.write("holding_registers", 0, [215, 0, 0x6162, 0x6300, 8, 65535])
+            made["devices"]["m"]["url"] = f"tcp://127.0.0.1:{serve({1: other}).address[1]}"
+            appliance.reload(load(saved(tmp_path, made)))
+            wire.until(lambda: len(rows(tmp_path)) == 8, "all are published, though some are equal")
+            assert values(tmp_path, "phases") == [[7, -1], [8, -1]]
+        else:
+            new = {"new": {"area": "holding_registers", "address": 1}}
+            made["profiles"] = {"meter": {"tags": METER["tags"] | new}}
+            appliance.reload(load(saved(tmp_path, made)))
+            wire.until(lambda: values(tmp_path, "new") == [0], "the new one is there")
+        tags = {reading.name for reading, _ in appliance.diagnostics.tag_values()}
+    assert tags == made["profiles"]["meter"]["tags"].keys()
+
+
+def test_a_device_has_its_tags_since_the_reload_that_changed_them_or_moved_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = settings(502)
     made["devices"]["other"] = dict(made["devices"]["m"])
     polls: Any = Polls()
-    found = TagValues(polls, time.monotonic())
+    found = TagValues(polls)
     monkeypatch.setattr(time, "time", lambda: 100.0)
-    found.adopt(load(saved(tmp_path, made)))
+    adopt(found, load(saved(tmp_path, made)))
     made["devices"]["m"]["tags"] = {"new": {"area": "coils", "address": 1}}
     monkeypatch.setattr(time, "time", lambda: 200.0)
-    found.adopt(load(saved(tmp_path, made)))
+    adopt(found, load(saved(tmp_path, made)))
     assert found.tagged_since == {"m": 200.0, "other": 100.0}
+    made["devices"]["other"]["unit"] = 2
+    monkeypatch.setattr(time, "time", lambda: 300.0)
+    adopt(found, load(saved(tmp_path, made)))
+    assert found.tagged_since == {"m": 200.0, "other": 300.0}
     del made["devices"]["m"]
-    found.adopt(load(saved(tmp_path, made)))
-    assert found.tagged_since == {"other": 100.0}
+    adopt(found, load(saved(tmp_path, made)))
+    assert found.tagged_since == {"other": 300.0}
 
 
 def test_a_device_that_another_node_polls_has_no_values(tmp_path: Path) -> None:
@@ -405,22 +467,21 @@ def test_a_device_that_another_node_polls_has_no_values(tmp_path: Path) -> None:
     made["outputs"]["out"]["publish"] = "change"
     config = load(saved(tmp_path, made))
     polls: Any = Polls()
-    found = TagValues(polls, time.monotonic())
-    found.adopt(config)
+    found = TagValues(polls)
+    name = adopt(found, config)["m"]
     buffer = found._outputs["out"].buffer
-    registers = [("holding_registers", 0, 6, bytes(12), 0, 0.0), ("coils", 0, 1, b"\0", 0, 0.0)]
 
     def poll(blocks: list[Any]) -> int:
         """How many readings the output got."""
         before = len(buffer)
-        found._handle(deque([("m", 0.0, blocks)]))
+        found._handle(deque([(name, 0.0, blocks)]))
         return len(buffer) - before
 
     assert poll([]) == 0
     assert (set(found.standby), found.answering()) == ({"m"}, {"m": False})
-    assert (poll(registers), poll(registers)) == (4, 0)
+    assert (poll(registers()), poll(registers())) == (4, 0)
     found.renew("out", {("m", "power"), ("m", "gone")})
-    assert (poll(registers), poll(registers)) == (1, 0)
+    assert (poll(registers()), poll(registers())) == (1, 0)
     assert (found.answering(), len(found.latest())) == ({"m": True}, 4)
     assert not found.standby
     answers = found.answers
@@ -431,13 +492,13 @@ def test_a_device_that_another_node_polls_has_no_values(tmp_path: Path) -> None:
     waiting = len(buffer)
     found.refresh("out")
     assert len(buffer) == waiting
-    found.adopt(config)
+    adopt(found, config)
     assert found.standby == {"m"}
     # Another node may have published another value meanwhile.
-    assert poll(registers) == 4
+    assert poll(registers()) == 4
     assert not found.standby
     poll([])
-    found.adopt(load(saved(tmp_path, settings(502, devices={}))))
+    adopt(found, load(saved(tmp_path, settings(502, devices={}))))
     assert not found.standby
 
 
@@ -446,7 +507,7 @@ def test_a_backlog_is_handled_in_turns_and_losses_are_counted(
 ) -> None:
     monkeypatch.setattr(tag_values, "_TURN_S", 0.0)
     polls: Any = Polls()
-    found = TagValues(polls, time.monotonic())
+    found = TagValues(polls)
     turns: list[int] = []
     offer = found._offer
 
@@ -460,13 +521,12 @@ def test_a_backlog_is_handled_in_turns_and_losses_are_counted(
     def observer(event: str, fields: Any, _by: object, _times: int) -> None:
         events.append((event, fields["count"]))
 
-    found.adopt(load(saved(tmp_path, settings(502))))
+    name = adopt(found, load(saved(tmp_path, settings(502))))["m"]
     log_lines.observe(observer)
     found.start()
     try:
-        registers = [("holding_registers", 0, 6, bytes(12), 0, 0.0)]
         polls.dropped = 7
-        polls.waiting.put(([("m", float(at), registers) for at in range(5)], []))
+        polls.waiting.put(([(name, float(at), registers()) for at in range(5)], []))
         wire.until(lambda: len(turns) >= 5 and bool(events), "all are handled")
     finally:
         polls.waiting.put(None)
@@ -482,10 +542,10 @@ def test_the_age_of_a_value_does_not_follow_the_clock(
 ) -> None:
     clocks = SimpleNamespace(time=lambda: 1_700_000_002.0, monotonic=lambda: 50.0)
     monkeypatch.setattr(tag_values, "time", clocks)
-    found = TagValues(cast("Any", Polls()), 0.0)
-    found.adopt(load(saved(tmp_path, settings(502))))
+    found = TagValues(cast("Any", Polls()))
+    name = adopt(found, load(saved(tmp_path, settings(502))))["m"]
     blocks: list[Any] = [("holding_registers", 0, 6, bytes(12), 0, 1_700_000_000.0)]
-    found._handle(deque([("m", 0.0, blocks)]))
+    found._handle(deque([(name, 0.0, blocks)]))
     clocks.time, clocks.monotonic = lambda: 1_700_003_602.0, lambda: 55.0
     _, ages = tag_metrics(cast("Any", SimpleNamespace(tag_values=found.latest_with_ages)))
     assert {sample.value for sample in ages.samples} == {7.0}

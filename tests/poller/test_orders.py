@@ -237,6 +237,24 @@ def test_a_poll_under_way_is_completed_before_the_device_is_replaced(
         assert [name for name, *_ in polls] == ["a", "d"]
 
 
+def test_polls_have_the_name_that_their_device_had_when_they_began(poller: ReportingPoller) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+
+    def answer(request: wire.Frame) -> bytes:
+        begun.set()
+        assert go_on.wait(wire.DEADLINE)
+        return data(request)
+
+    with Fake(answer) as fake:
+        poller.add(device(fake, reported_as="before"))
+        assert begun.wait(wire.DEADLINE)
+        poller.replace("a", device(fake, reported_as="after"))
+        go_on.set()
+        polls, _ = taken(poller, lambda polls, _: len(polls) == 2)
+        assert [name for name, *_ in polls] == ["before", "after"]
+        assert list(poller.counters()) == ["a"]
+
+
 def test_a_unit_that_is_given_a_rest_keeps_it_when_its_device_is_replaced(
     poller: ReportingPoller,
 ) -> None:

@@ -57,7 +57,7 @@ pub struct PolledDevice {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl PolledDevice {
     #[new]
-    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=MAX_REGISTERS, max_bits=MAX_BITS, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, receiver=None, fields=None, release=false, measured=false, retry=None, jitter=true, fence=None))]
+    #[pyo3(signature = (name, endpoint, *, unit, interval, timeout, reads, max_gap=None, cost=None, max_registers=MAX_REGISTERS, max_bits=MAX_BITS, readable=None, forbidden=None, forward=None, status=None, start_within=None, in_flight=1, receiver=None, reported_as=None, fields=None, release=false, measured=false, retry=None, jitter=true, fence=None))]
     fn new(
         name: String,
         endpoint: PyRef<'_, Endpoint>,
@@ -76,6 +76,7 @@ impl PolledDevice {
         start_within: Option<f64>,
         in_flight: Option<i128>,
         receiver: Option<PyRef<'_, PollReceiver>>,
+        reported_as: Option<String>,
         fields: Option<Vec<(String, u32, u32)>>,
         release: bool,
         measured: bool,
@@ -120,6 +121,7 @@ impl PolledDevice {
                 None => FIRST_POLL_SPREAD.min(seconds("interval", interval)?),
             },
             report: receiver.map(|receiver| Arc::clone(&receiver.core)),
+            reported_as,
             release,
             measured,
             fence: fence.map(|fence| Arc::clone(&fence.core)),

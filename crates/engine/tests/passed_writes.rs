@@ -102,6 +102,7 @@ fn settings(name: &str, address: SocketAddr, memory: &Arc<Memory>) -> DeviceSett
         status: None,
         start_within: Duration::ZERO,
         report: None,
+        reported_as: None,
         release: false,
         fence: None,
     }

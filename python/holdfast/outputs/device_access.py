@@ -53,7 +53,7 @@ class Site(Protocol):
         """The tags of each device."""
 
     def tagged_since(self) -> Mapping[str, float]:
-        """Since when each device has had its tags: older readings are of an earlier start."""
+        """Since when each device has had its tags and address: older readings are of others."""
 
     def devices(self) -> Mapping[str, DeviceInfo]:
         """What is known of each device."""

@@ -64,6 +64,8 @@ pub struct DeviceSettings {
     pub start_within: Duration,
     /// A queue that also receives the polls.
     pub report: Option<Arc<Results>>,
+    /// The name of the device in these polls, if it has another one there.
+    pub reported_as: Option<String>,
     /// Whether the connection is closed after each poll, for devices that accept only one.
     pub release: bool,
     /// Until when the device may be used. Devices of one link have the same, or none.
@@ -90,6 +92,7 @@ impl DeviceSettings {
             status: None,
             start_within: Duration::ZERO,
             report: None,
+            reported_as: None,
             release: false,
             fence: None,
         }
@@ -107,7 +110,7 @@ pub(super) struct Device {
     pub(super) fields: Vec<Field>,
     /// For each field, the index of its read, and its offset in it, in items.
     parts: Vec<(usize, u32)>,
-    name: Arc<str>,
+    reported_as: Arc<str>,
     learned: RefCell<Learned>,
     /// `None` while the device has no plan. The state has the error.
     plan: RefCell<Option<Rc<Vec<Block>>>>,
@@ -221,7 +224,7 @@ impl Device {
         let device = Device {
             fields,
             parts,
-            name: settings.name.as_str().into(),
+            reported_as: settings.reported_as.as_ref().unwrap_or(&settings.name).as_str().into(),
             learned: RefCell::default(),
             plan: RefCell::default(),
             first: Cell::new(0),
@@ -527,7 +530,7 @@ impl Device {
     /// Sends the blocks of a poll to the results. Called after the health of the poll is stored.
     fn hand_over(&self, due: Instant, gathered: Gathered) {
         if let Some(results) = &self.settings.report {
-            let (device, blocks) = (Arc::clone(&self.name), gathered.blocks);
+            let (device, blocks) = (Arc::clone(&self.reported_as), gathered.blocks);
             results.push(Poll { device, due: results.counted(due.into_std()), blocks });
         }
     }

@@ -20,6 +20,7 @@ const MAX_POLLS: usize = 16_384;
 /// One poll of one device.
 #[derive(Debug, Clone)]
 pub struct Poll {
+    /// [`super::DeviceSettings::reported_as`], or the name.
     pub device: Arc<str>,
     /// The scheduled time, counted from the start of the poller. A poll outside the schedule has
     /// the time when it began.

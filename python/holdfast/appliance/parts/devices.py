@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from typing import TYPE_CHECKING, Any
 
 from holdfast import _core
@@ -39,8 +38,6 @@ class Devices(Part):
         super().__init__(config)
         self._audit, self._leases, self._mirrors = audit, leases, mirrors
         self.poller: _core.Poller | None = None
-        self._began = 0.0
-        """When the poller was created."""
         self.values: TagValues | None = None
         """The values of tags. `None` until there are tags, as is `writes`."""
         self.writes: TagWrites | None = None
@@ -82,20 +79,23 @@ class Devices(Part):
             if native_links.destination(config, name) == native_links.destination(self.config, name)
         }
         if poller is None and (polled or config.links or routed(config) or config.nats is not None):
-            self._began = time.monotonic()
             poller = _core.Poller([])
             plan.undo.callback(poller.stop)
         if poller is not None:
             if values is None and any(config.devices[name].has_tags for name in polled):
-                values = TagValues(poller.new_receiver(), self._began)
+                values = TagValues(poller.new_receiver())
                 writes = TagWrites(poller, self._audit.log, values.find)
             # The first use of an address decides the settings of its connection: links first.
             plan.links = native_links.links(config, plan.memories, poller, withdrawals)
+        altered = [name for name in config.devices if f"devices.{name}" in plan.changed]
+        tagged = {} if values is None else values.tagged(config, altered)
         results = None if values is None else values.results
         made = {
-            name: native_devices.device(name, plan, results, self._leases.fence(name, config))
-            for name in config.devices
-            if name in polled and f"devices.{name}" in plan.changed
+            name: native_devices.device(
+                name, plan, results, tagged.get(name), self._leases.fence(name, config)
+            )
+            for name in altered
+            if name in polled
         }
 
         def adopt() -> None:
@@ -104,8 +104,9 @@ class Devices(Part):
                 self._withdrawals[name].withdraw()
             self._withdrawals = plan.links.withdrawals
             replaced = made.keys() & self._polled
+            unread: set[str] = set()
             if values is not None:
-                values.adopt(config, replaced)
+                unread = values.adopt(config, tagged)
                 values.start()
             self.passages.update(plan.links.passages)
             for name in self.passages.keys() - plan.links.passages.keys():
@@ -120,13 +121,11 @@ class Devices(Part):
                     poller.remove(name)
                 for name, device in made.items():
                     if name in replaced:
-                        poller.replace(name, device, at_once=False)
+                        poller.replace(name, device, at_once=name in unread)
                     else:
                         poller.add(device)
                 # The gateway may hold some that are out of use, with settings that may come back.
                 poller.forget_links(list(self._links.values()))
-            if values is not None:
-                values.have_begun(replaced)
             self._polled = polled
             changed = {key.partition(".")[2] for key in plan.changed}
             refused = {link: on.counters()["refused_full"] for link, on in self._links.items()}

@@ -11,7 +11,6 @@ from holdfast import _core
 from holdfast.appliance.parts.mirror_place import place_of
 from holdfast.appliance.parts.native_links import endpoint_at
 from holdfast.config import read_plans
-from holdfast.polling.readings import Reader
 from holdfast.types import AREAS
 
 if TYPE_CHECKING:
@@ -19,6 +18,7 @@ if TYPE_CHECKING:
 
     from holdfast._core import Memory
     from holdfast.appliance.parts.part import Plan
+    from holdfast.appliance.parts.tag_values import TaggedDevice
     from holdfast.config.models.devices import (
         BlockConfig,
         ForwardConfig,
@@ -32,15 +32,16 @@ def device(
     name: str,
     plan: Plan,
     receiver: _core.PollReceiver | None,
+    tagged: TaggedDevice | None,
     fence: _core.Fence | None = None,
 ) -> _core.PolledDevice:
     """Creates the native poller's device of that name. Raises `OSError` for unusable files.
 
-    `receiver` takes the polls of devices with tags. A `fence` stops polls while it is closed.
+    `receiver` takes the polls of a device that is `tagged`. A `fence` stops polls while it is
+    closed.
     """
     config, memories = plan.config, plan.memories
     settings = config.devices[name]
-    fields = list(Reader(name, config.tags(name)).fields)
     status = settings.status
     assert settings.interval is not None, "a device that is polled has an interval"
     return _core.PolledDevice(
@@ -63,8 +64,9 @@ def device(
         in_flight=None if settings.in_flight == "auto" else settings.in_flight,
         retry=settings.retry.pauses,
         measured=settings.max_gap == "auto",
-        receiver=receiver if fields else None,
-        fields=fields,
+        receiver=None if tagged is None else receiver,
+        reported_as=None if tagged is None else tagged.reported_as,
+        fields=None if tagged is None else list(tagged.reader.fields),
         fence=fence,
         **read_plans.rules(settings),
     )

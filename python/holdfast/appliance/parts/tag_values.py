@@ -7,14 +7,14 @@ the oldest.
 
 from __future__ import annotations
 
+import itertools
 import logging
 import threading
 import time
 from collections import deque
 from dataclasses import dataclass
 from functools import partial
-from math import inf
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from holdfast.client.url import NetworkTarget
 from holdfast.config.models.devices import DeviceIdentityConfig
@@ -56,7 +56,8 @@ _LATE_S = 1.0
 """Age of a poll from which on the thread rests between turns as long as they take."""
 
 Poll: TypeAlias = "tuple[str, float, list[PolledBlock]]"
-"""The device, the scheduled time in seconds, and the blocks: none if another node polls it now."""
+"""`reported_as` of the device, the scheduled time in seconds, and the blocks: none if another node
+polls it now."""
 
 
 def _is_late(poll: Poll) -> bool:
@@ -73,6 +74,26 @@ def _info(device: DeviceConfig) -> DeviceInfo:
         identity.model_name or device.profile,
         identity.revision,
     )
+
+
+class TaggedDevice(NamedTuple):
+    """A device with tags, which a reload replaces if they or their source change."""
+
+    source: tuple[str, int]
+    """Its URL and its unit id: with others, it is another machine."""
+    reader: Reader
+    reported_as: str
+    """Its name in polls, which no other `TaggedDevice` has: a poll may come late."""
+
+
+def _kept(poll: DevicePoll, before: TaggedDevice, now: TaggedDevice | None) -> list[Reading]:
+    """What a reload leaves of a poll: the readings of the same machine whose tags are as before."""
+    if now is before:
+        return poll.readings
+    if now is None or now.source != before.source:
+        return []
+    tags = now.reader.named
+    return [reading for reading in poll.readings if tags.get(reading.name) == reading.tag]
 
 
 @dataclass
@@ -106,15 +127,13 @@ class TagValues:
     Ends with the poller.
     """
 
-    def __init__(self, results: PollReceiver, began: float) -> None:
-        """`began` is when the poller was created, by `time.monotonic`."""
+    def __init__(self, results: PollReceiver) -> None:
         self.results = results
-        self._began = began
         self._lock = threading.Lock()
+        self._numbers = itertools.count(1)
+        self._tagged: dict[str, TaggedDevice] = {}
         self._readers: dict[str, Reader] = {}
-        self._since: dict[str, float] = {}
-        """When a replaced device began, in seconds since the poller's start: polls from before are
-        those of the device that it has replaced."""
+        """By the name in polls."""
         self._outputs: dict[str, _Output] = {}
         self._latest: dict[str, tuple[DevicePoll, float]] = {}
         """The last poll of each device, and by how much the clock was ahead of `time.monotonic`
@@ -127,7 +146,7 @@ class TagValues:
         self.devices: dict[str, DeviceInfo] = {}
         """What is known of each device with tags. Replaced as a whole."""
         self.tagged_since: dict[str, float] = {}
-        """Since when each device has had its tags. Replaced as a whole."""
+        """Since when each device has had its source and its tags. Replaced as a whole."""
         self.retained: dict[tuple[str, str], str] = {}
         """Of each broker and topic that it retains, the output that published it: see `Site`."""
         self.answers = 0
@@ -156,37 +175,46 @@ class TagValues:
         for name, output in self._outputs.items():
             log_unsent(name, output.buffer)
 
-    def adopt(self, config: Config, replaced: Collection[str] = ()) -> None:
+    def tagged(self, config: Config, changed: Collection[str]) -> dict[str, TaggedDevice]:
+        """The devices with tags, for `adopt`. Those of which other settings have changed stay."""
+        found: dict[str, TaggedDevice] = {}
+        for name, device in config.devices.items():
+            if not device.is_polled or not len(tags := config.tags(name)):
+                continue
+            source, known = (device.url, device.unit), self._tagged.get(name)
+            is_same = known is not None and (
+                name not in changed or (known.source, known.reader.tags) == (source, tuple(tags))
+            )
+            if known is None or not is_same:
+                known = TaggedDevice(source, Reader(name, tags), f"{name}#{next(self._numbers)}")
+            found[name] = known
+        return found
+
+    def adopt(self, config: Config, tagged: dict[str, TaggedDevice]) -> set[str]:
         """Takes over devices and outputs. Outputs keep what they have to send.
 
-        Polls of devices that will be `replaced` are dropped until `have_begun`.
+        Returns the devices that are not as before: the values of some of their tags are unknown.
         """
-        readers = {
-            name: Reader(name, tags)
-            for name, device in config.devices.items()
-            if device.is_polled and len(tags := config.tags(name))
-        }
         with self._lock:
-            before = {name: reader.tags for name, reader in self._readers.items()}
-            now = {name: reader.tags for name, reader in readers.items()}
-            changed = {name for name in {*before, *now} if before.get(name) != now.get(name)}
-            devices = {name: _info(config.devices[name]) for name in readers}
+            before, self._tagged = self._tagged, tagged
+            changed = {
+                name for name in {*before, *tagged} if before.get(name) is not tagged.get(name)
+            }
+            devices = {name: _info(config.devices[name]) for name in tagged}
             self.revision += bool(changed) or devices != self.devices
             self.devices = devices
             began = {name: at for name, at in self.tagged_since.items() if name not in changed}
-            self.tagged_since = dict.fromkeys(readers, time.time()) | began
+            self.tagged_since = dict.fromkeys(tagged, time.time()) | began
             self._answering = {
-                name: answers for name, answers in self._answering.items() if name in readers
+                name: answers for name, answers in self._answering.items() if name in tagged
             }
-            self.standby &= readers.keys()
-            # A reader keeps its decoders while the tags of its device stay.
-            unchanged = {name: self._readers[name] for name in readers if name not in changed}
-            self._readers = readers | unchanged
+            self.standby &= tagged.keys()
+            self._readers = {each.reported_as: each.reader for each in tagged.values()}
             self._latest = {
-                name: found for name, found in self._latest.items() if name not in changed
+                name: (poll._replace(readings=kept), ahead)
+                for name, (poll, ahead) in self._latest.items()
+                if (kept := _kept(poll, before[name], tagged.get(name)))
             }
-            since = {name: at for name, at in self._since.items() if name in readers}
-            self._since = since | dict.fromkeys(replaced, inf)
             outputs: dict[str, _Output] = {}
             for name, settings in config.outputs.items():
                 known = self._outputs.get(name)
@@ -201,11 +229,7 @@ class TagValues:
             self._outputs = outputs
         for name, output in gone.items():
             log_unsent(name, output.buffer)
-
-    def have_begun(self, replaced: Collection[str]) -> None:
-        """Takes polls of these devices again: they are those of the new configuration."""
-        with self._lock:
-            self._since |= dict.fromkeys(replaced, time.monotonic() - self._began)
+        return changed & tagged.keys()
 
     def sending(self, name: str, receiver: Callable[[], Receiver]) -> Sending:
         """The adapter of an output."""
@@ -238,8 +262,8 @@ class TagValues:
 
     def find(self, device: str, tag: str) -> Tag | None:
         """A tag of the configuration."""
-        reader = self._readers.get(device)
-        return None if reader is None else reader.named.get(tag)
+        known = self._tagged.get(device)
+        return None if known is None else known.reader.named.get(tag)
 
     def latest(self) -> list[Reading]:
         """The last reading of each tag. Thread-safe."""
@@ -259,8 +283,8 @@ class TagValues:
     def tags(self) -> dict[str, tuple[Tag, ...]]:
         """The tags of each device. Thread-safe."""
         with self._lock:
-            readers = self._readers
-        return {name: reader.tags for name, reader in readers.items()}
+            tagged = self._tagged
+        return {name: device.reader.tags for name, device in tagged.items()}
 
     def answering(self) -> dict[str, bool]:
         """Whether each device answers, as far as it is known. Thread-safe."""
@@ -271,7 +295,7 @@ class TagValues:
         """Offers the last value of each tag to an output again. Thread-safe."""
         with self._lock:
             if (known := self._outputs.get(output)) is not None and not self._ending.is_set():
-                known.changes.forget(self._readers)
+                known.changes.forget(self._tagged)
                 known.offer(poll for poll, _ in self._latest.values())
 
     def renew(self, output: str, tags: Collection[tuple[str, str]] | None) -> None:
@@ -324,11 +348,9 @@ class TagValues:
     def _turn(self, found: deque[Poll], until: float) -> Iterator[DevicePoll]:
         """Takes and converts polls until a time, at least one."""
         while found:
-            name, start, blocks = found.popleft()
-            # That a device stands by is reported once: it may have begun before the reload ended.
-            is_new = not blocks or start >= self._since.get(name, 0.0)
-            if name in self._readers and is_new:
-                yield self._readers[name].poll(blocks)
+            reported_as, _, blocks = found.popleft()
+            if (reader := self._readers.get(reported_as)) is not None:
+                yield reader.poll(blocks)
             if time.monotonic() >= until:
                 return
 
