@@ -12,6 +12,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from nats.errors import NoRespondersError
 from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.config.values.scanner_settings import parse_pollable
@@ -26,14 +27,16 @@ from holdfast.scanner.settings import FleetSettings, Settings
 from holdfast.scanner.subscriptions.key import SubscriptionKey
 from holdfast.tags import Tag, TagList
 from support import wire
+from support.brokers import NatsServer
 from support.cli import invoke
 from support.fake_device import FakeDevice, exception, registers
 from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges
-from support.leases import BRIEF
-from support.nats_bus import Caller
+from support.leases import BRIEF, ENDLESS
+from support.nats_bus import Caller, logged
 from support.scanner_parts import (
     allowed_of,
+    broker_of,
     client_of,
     member_of,
     polling_of,
@@ -44,10 +47,10 @@ from support.tentacle import subject_part
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
-    from support.brokers import NatsServer
     from support.judges import Judge
     from support.nats_bus import Run, Running
 
@@ -290,7 +293,8 @@ def test_a_command_reaches_the_device_whoever_receives_it(
     node: Callable[..., Running], caller: Caller, judges: Judges
 ) -> None:
     nodes = [node(name) for name in "abc"]
-    wire.until(lambda: sum(map(partitions, nodes)) == PARTITIONS, "all have a node")
+    # Each has its share: a device that moves is written to over another connection.
+    wire.until(lambda: sorted(map(partitions, nodes)) == [5, 5, 6], "the partitions are shared")
     subscribe_all(caller, judges)
     for value in range(12):
         for number in range(len(judges.devices)):
@@ -466,6 +470,40 @@ def test_a_name_that_is_looked_up_delays_no_other_device(
     assert is_asked.wait(wire.DEADLINE)
     caller.put(WANTS, D1, caller.text(WANTS, D1).replace('"address":0', '"address":10'))
     wire.until(lambda: devices_of(running)["d1"].tags["t1"].address == 10, "it is adopted")
+
+
+def test_a_process_that_has_not_joined_takes_no_requests_from_the_nodes(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    share(node("a"))
+    subscribe_all(caller, judges)
+    # It waits for ever until the name is free.
+    other = node("a", ENDLESS, wait=False)
+    wire.until(lambda: member_of(other.scanner).desired.is_read.is_set(), "it tries to join")
+    assert not other.serves
+    for _ in range(20):
+        assert caller.request("modbus.browse", "")["count"] == 4
+    broker = broker_of(other.scanner)
+    other.do(broker.drain())
+    listening = broker._listening
+    assert listening is not None
+    wire.until(listening.done, "it takes none if it joins while it stops")
+
+
+def test_without_jetstream_callers_learn_that_there_is_no_node(
+    run_scanner: Run, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bare = NatsServer(tmp_path, jetstream=False)
+    try:
+        running = run_scanner(bare, wait=False, fleet=FleetSettings(FLEET, "a", PARTITIONS))
+        wire.until(lambda: logged(caplog, "leases_unavailable"), "it is logged")
+        [found] = logged(caplog, "leases_unavailable")
+        assert found["reason"] == "JetStream is not enabled on the server or for this account"
+        with Caller(bare.url) as caller, pytest.raises(NoRespondersError):
+            caller.request("modbus.browse", "")
+        running.stop()
+    finally:
+        bare.kill()
 
 
 def test_many_devices_are_browsed_in_pages(

@@ -18,11 +18,13 @@ from holdfast.net.nats import outbox as outboxes
 from holdfast.net.nats.connection import Broker, Ping, Servers
 from holdfast.net.nats.outbox import Outbox
 from holdfast.net.nats.tolerant_client import SafeClient
+from holdfast.scanner import responder
 from holdfast.scanner.commands import Commands
 from holdfast.scanner.dialects import TENTACLE
 from holdfast.scanner.errors import Moved
 from holdfast.scanner.jetstream.heartbeat import HeartbeatKey
 from holdfast.scanner.messages.types import (
+    Answer,
     BrowseRequest,
     EntryReport,
     HeartbeatMetadata,
@@ -680,3 +682,43 @@ def test_a_command_that_was_not_written_is_not_confirmed() -> None:
     commands = Commands(settings, TENTACLE, registry, unused, Elsewhere(), unused)
     with pytest.raises(Moved, match="not written: this node may not use the device now"):
         asyncio.run(commands.write("plc", "a", "1", lambda: 1.0))
+
+
+@pytest.mark.parametrize(
+    ("limit", "kind", "expected"),
+    [
+        ("READY_WITHIN_S", "browse", "subscriptions are not read yet: try again"),
+        ("READY_WITHIN_S", "command", "not written: subscriptions are not read yet: try again"),
+        (
+            "MAX_WAITING_BYTES",
+            "command",
+            "not written: too many requests: 0 bytes of them wait, which is the limit",
+        ),
+    ],
+)
+def test_requests_do_not_wait_for_ever_until_the_scanner_is_ready(
+    monkeypatch: pytest.MonkeyPatch, limit: str, kind: str, expected: str
+) -> None:
+    monkeypatch.setattr(responder, limit, 0)
+
+    async def work() -> list[bytes]:
+        answers: list[bytes] = []
+        has_answered = asyncio.Event()
+
+        class Answers(Outbox):
+            async def answer(self, _subject: str, payload: bytes) -> None:
+                answers.append(payload)
+                has_answered.set()
+
+        async def handle(_: Msg) -> Answer:
+            return Answer(success=True)
+
+        waiting = responder.Responder(10, Answers(), asyncio.Event().wait)
+        message = Msg(cast("Client", None), "modbus.browse", reply="_INBOX.1", data=b"{}")
+        await waiting.answering(kind, handle)(message)
+        await has_answered.wait()
+        await waiting.end()
+        return answers
+
+    [answer] = asyncio.run(work())
+    assert json.loads(answer) == {"success": False, "error": expected}

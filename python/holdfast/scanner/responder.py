@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import msgspec
 
 from holdfast.events import log_lines
+from holdfast.polling.write_ttl import WRITE_TTL_S
 from holdfast.runtime import tasks
 from holdfast.scanner.errors import STOPPING, NotConfirmed, Refused
 from holdfast.scanner.messages.types import Answer, BrowseAnswer
@@ -24,6 +25,12 @@ if TYPE_CHECKING:
 
 Handle: TypeAlias = "Callable[[Msg], Awaitable[Answer | BrowseAnswer | bytes]]"
 """Carries out a message. Returns the answer, or its JSON."""
+
+READY_WITHIN_S = WRITE_TTL_S
+"""How long requests wait until the scanner is ready: as long as a command may wait at all."""
+
+MAX_WAITING_BYTES = 64 * 1024 * 1024
+"""The limit of the bytes of all requests that wait until then."""
 
 LARGE_REQUEST_BYTES = 16 * 1024
 """Size of a request that takes milliseconds to parse."""
@@ -42,6 +49,7 @@ class Responder:
         self._tasks: set[asyncio.Task[None]] = set()
         self._request_lock = asyncio.Lock()
         """Held while a request is parsed and checked."""
+        self._waiting_bytes = 0
 
     def answering(self, kind: str, handle: Handle) -> Callable[[Msg], Awaitable[None]]:
         """Returns a handler that carries out messages concurrently and answers them."""
@@ -70,8 +78,7 @@ class Responder:
             if len(self._tasks) > self._max_pending:
                 limit = f"{self._max_pending} are pending, which is the limit"
                 raise Refused(f"too many requests: {limit}")
-            for wait in self._until_ready:
-                await wait()
+            await self._wait_until_ready(kind, len(message.data))
             return await handle(message)
         except Refused as refused:
             more = {"outcome": "not_confirmed"} if isinstance(refused, NotConfirmed) else {}
@@ -89,6 +96,22 @@ class Responder:
         except Exception as error:  # An error in one request must not stop the service.
             log_lines.problem("request_failed", subject=message.subject)
             return Answer(success=False, error=f"internal error: {type(error).__name__}")
+
+    async def _wait_until_ready(self, kind: str, size: int) -> None:
+        """Raises `Refused` after some seconds, or if requests of too many bytes wait already."""
+        outcome = "not written: " if kind == "command" else ""
+        if self._waiting_bytes + size > MAX_WAITING_BYTES:
+            limit = f"{MAX_WAITING_BYTES} bytes of them wait, which is the limit"
+            raise Refused(f"{outcome}too many requests: {limit}")
+        self._waiting_bytes += size
+        try:
+            async with asyncio.timeout(READY_WITHIN_S):
+                for wait in self._until_ready:
+                    await wait()
+        except TimeoutError:
+            raise Refused(f"{outcome}subscriptions are not read yet: try again") from None
+        finally:
+            self._waiting_bytes -= size
 
     def begin(self, work: Coroutine[Any, Any, None]) -> None:
         """Runs a task that `end` ends."""

@@ -135,6 +135,7 @@ class Scanner:
             settings.ping,
             shared=self._placement.shared_subjects,
             queue=self._placement.queue_group,
+            until_member=self._ready.wait if self._placement.shared_subjects else None,
             max_pause_s=settings.max_pause_s,
         )
 

@@ -10,13 +10,14 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from nats.errors import Error
+from nats.js.errors import APIError, ServiceUnavailableError
 
 from holdfast.events import log_lines
 from holdfast.net.nats.credentials import Credentials
@@ -50,6 +51,8 @@ CHECK_INTERVAL_S = 1.0
 
 CLOSE_TIMEOUT_S = 1.5
 """Seconds to send the last messages when a client is closed."""
+
+NO_JETSTREAM = "JetStream is not enabled on the server or for this account"
 
 ANSWERING = 3.0
 """Seconds in which servers must answer the first request of a command."""
@@ -121,6 +124,8 @@ class Broker:
     shared: Collection[str] = ()
     """The subjects whose messages go to one of all members of `queue`."""
     queue: str = ""
+    until_member: Callable[[], Awaitable[object]] | None = None
+    """Returns when this is a member of `queue`: what it gets before, no other member gets."""
     max_pause_s: float = MAX_PAUSE
     """Seconds between attempts to connect."""
 
@@ -133,6 +138,7 @@ class Broker:
         """The client while there is a connection."""
         self._subscribed = False
         self._subscriptions: list[Subscription] = []
+        self._listening: asyncio.Task[None] | None = None
 
     @property
     def serves(self) -> bool:
@@ -161,6 +167,8 @@ class Broker:
 
     async def drain(self) -> None:
         """Takes no further messages. Handlers are called for all that the server has sent."""
+        if self._listening is not None:
+            self._listening.cancel()
         if self.client is not None:
             with contextlib.suppress(Error, OSError):
                 await self.client.drain_all(self._subscriptions)
@@ -201,7 +209,7 @@ class Broker:
             self._note(client, error)
             return
         self._note_connected(client)
-        listening = asyncio.create_task(self._listen(client, ended))
+        listening = self._listening = asyncio.create_task(self._listen(client, ended))
         try:
             await _given_up(client, ended)
         finally:
@@ -212,15 +220,23 @@ class Broker:
         """Subscribes to all subjects. Sets `ended` on failure."""
         self._subscriptions = []
         try:
-            for subject, handler in self.handlers.items():
-                queue = self.queue if subject in self.shared else ""
-                made = await client.subscribe(subject, queue=queue, cb=handler)
-                self._subscriptions.append(made)
+            own = [each for each in self.handlers if each not in self.shared]
+            await self._subscribe(client, own)
+            if self.until_member is not None:
+                await self.until_member()
+            await self._subscribe(client, self.shared, self.queue)
             await client.flush()
             self._subscribed = True
         except (Error, OSError) as error:
             self._note(client, error)
             ended.set()
+
+    async def _subscribe(
+        self, client: SafeClient, subjects: Iterable[str], queue: str = ""
+    ) -> None:
+        for subject in subjects:
+            made = await client.subscribe(subject, queue=queue, cb=self.handlers[subject])
+            self._subscriptions.append(made)
 
     def _note_connected(self, client: SafeClient) -> None:
         url = client.connected_url
@@ -260,7 +276,11 @@ class Broker:
 
 
 def nats_reason(error: Exception) -> str:
-    """Why something on NATS failed, for people: without the mark that nats-py puts first."""
+    """Why something on NATS failed, for people: without the marks of nats-py."""
+    if isinstance(error, APIError) and error.description:
+        return error.description
+    if isinstance(error, ServiceUnavailableError):
+        return NO_JETSTREAM
     return failure_text(error).removeprefix("nats: ")
 
 

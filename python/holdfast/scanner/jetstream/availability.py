@@ -6,9 +6,10 @@ import logging
 from enum import Enum
 
 from nats.errors import NoRespondersError, TimeoutError
-from nats.js.errors import APIError, ServiceUnavailableError
+from nats.js.errors import APIError
 
 from holdfast.events import log_lines
+from holdfast.net.nats.connection import NO_JETSTREAM, nats_reason
 
 JETSTREAM_TIMEOUT_S = 2.0
 """Time to wait for an answer of JetStream."""
@@ -58,10 +59,10 @@ class Availability:
 
 def reason_of(error: Exception) -> str:
     """Returns why JetStream failed."""
-    if isinstance(error, APIError) and error.description:
-        return error.description
-    if isinstance(error, ServiceUnavailableError | NoRespondersError):
-        return "JetStream is not enabled on the server or for this account"
+    if isinstance(error, APIError):
+        return nats_reason(error)
+    if isinstance(error, NoRespondersError):
+        return NO_JETSTREAM
     if isinstance(error, TimeoutError):
         return f"JetStream did not answer within {JETSTREAM_TIMEOUT_S:g} s"
     return str(error) or type(error).__name__
