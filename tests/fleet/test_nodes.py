@@ -14,13 +14,15 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import NoRespondersError
 from nats.errors import TimeoutError as NoAnswer
+from nats.js.api import StreamConfig
 
 from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.net.nats.connection import Servers
 from holdfast.net.nats.outbox import Outbox
 from holdfast.replication.leases.bucket import Outdated
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
-from holdfast.scanner.fleet import reports
+from holdfast.scanner.errors import Refused
+from holdfast.scanner.fleet import desired_state, reports
 from holdfast.scanner.fleet.agreement import FleetRefused
 from holdfast.scanner.service import Scanner
 from holdfast.scanner.settings import FleetSettings, Settings
@@ -504,6 +506,96 @@ def test_without_jetstream_callers_learn_that_there_is_no_node(
         running.stop()
     finally:
         bare.kill()
+
+
+def test_a_deletion_ends_everywhere(
+    node: Callable[..., Running],
+    caller: Caller,
+    judges: Judges,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(desired_state, "DELETION_TTL_S", 1)
+    nodes = [node(name, check_interval_s=0.1) for name in "ab"]
+    share(*nodes)
+    subscribe_all(caller, judges)
+    for number in range(4):
+        unsubscribe(caller, number)
+
+    def remembered() -> list[object]:
+        members = [member_of(each.scanner) for each in nodes]
+        return [each for of in members for each in (*of.desired._values, *of._applied)]
+
+    wire.until(lambda: subjects(caller) == {f"$KV.{WANTS}.terms": 1}, "the bucket has none of them")
+    wire.until(lambda: not remembered(), "nor have the nodes")
+    subscribe_all(caller, judges)
+    wire.until(lambda: all(len(devices_of(each)) == 4 for each in nodes), "all are known again")
+
+
+def subjects(caller: Caller) -> dict[str, int]:
+    """The keys in the bucket of subscriptions, also those that are deleted."""
+    jetstream = caller.client.jetstream()
+    found = caller.do(jetstream.stream_info(f"KV_{WANTS}", subjects_filter=">"))
+    return found.state.subjects or {}
+
+
+def unsubscribe(caller: Caller, number: int) -> None:
+    ended = {"deviceId": f"d{number}", "subscriberId": "hmi", "tagIds": "all"}
+    assert caller.request("modbus.unsubscribe", ended) == {"success": True}
+
+
+def end_deletion(caller: Caller, number: int) -> None:
+    """Removes a device from the bucket without a message, as the end of its deletion does."""
+    key = (D0, D1)[number]
+    purge = caller.client.jetstream().purge_stream(f"KV_{WANTS}", subject=f"$KV.{WANTS}.{key}")
+    assert caller.do(purge)
+
+
+def test_a_deletion_that_ended_while_a_node_was_away_is_found(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    running = node("a", check_interval_s=0.1)
+    share(running)
+    subscribe_all(caller, judges)
+    end_deletion(caller, 0)
+    bucket = member_of(running.scanner).desired._bucket
+    assert bucket is not None
+    running.do(bucket.unfollow())
+    wire.until(lambda: sorted(devices_of(running)) == ["d1", "d2", "d3"], "it is deleted here")
+
+
+def test_a_change_of_a_device_whose_deletion_has_ended_begins_anew(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    running = node("a", check_interval_s=1000.0)
+    share(running)
+    subscribe_all(caller, judges)
+    end_deletion(caller, 0)
+    request = wanted(judges.devices[0], subscriberId="trend")
+    assert caller.request("modbus.subscribe", request)["success"]
+    assert list(devices_of(running)["d0"].subscribers) == ["trend"]
+    end_deletion(caller, 0)
+    assert running.do(written(running)) == "no tag 't0' of d0"
+
+
+async def written(running: Running) -> str:
+    """Why a command is refused, while the node follows the bucket anew."""
+    desired = member_of(running.scanner).desired
+    desired._doubted.add("d0")
+    with pytest.raises(Refused) as refused:
+        await running.scanner._commands.write("d0", "t0", "5", lambda: 10.0)
+    return str(refused.value)
+
+
+def test_deletions_end_in_a_bucket_that_was_made_without_ttls(
+    node: Callable[..., Running], caller: Caller, judges: Judges
+) -> None:
+    config = StreamConfig(f"KV_{WANTS}", subjects=[f"$KV.{WANTS}.>"], max_msgs_per_subject=1)
+    caller.do(caller.client.jetstream().add_stream(config))
+    share(node("a"))
+    subscribe_all(caller, judges)
+    unsubscribe(caller, 0)
+    found = caller.do(caller.client.jetstream().get_last_msg(f"KV_{WANTS}", f"$KV.{WANTS}.{D0}"))
+    assert (found.headers or {})["Nats-TTL"] == "3600s"
 
 
 def test_many_devices_are_browsed_in_pages(

@@ -116,9 +116,10 @@ class Bucket:
         self.stored = {}
         self.has_failed = False
 
-    async def make(self, *_: int) -> Any:
+    async def make(self, *_: int, **settings: bool) -> Any:
         state = SimpleNamespace(last_seq=self._revision)
-        return SimpleNamespace(created=self.number, state=state)
+        config = SimpleNamespace(**settings)
+        return SimpleNamespace(created=self.number, state=state, config=config)
 
     async def publish(self, key: str, value: bytes, _: int, __: dict[str, str]) -> int:
         if self.number and not self.has_failed and key != desired_state.TERMS:

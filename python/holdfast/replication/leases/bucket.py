@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import itertools
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -194,6 +194,11 @@ class KeyBucket:
             )
             await create_stream(jetstream, config, replicas)
             return await jetstream.stream_info(self._stream)
+
+    async def allow_ttls(self, config: StreamConfig) -> None:
+        """Lets keys of a bucket with these settings have a TTL. Raises the errors of nats-py."""
+        jetstream = self.client.jetstream(timeout=self._request_timeout_s)
+        await jetstream.update_stream(replace(config, allow_msg_ttl=True))
 
     async def publish(self, key: str, value: bytes, revision: int, headers: dict[str, str]) -> int:
         """Replaces the revision of a key, 0 if there is none. Returns the new revision.

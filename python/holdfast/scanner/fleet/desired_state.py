@@ -6,6 +6,7 @@ import asyncio
 import base64
 import contextlib
 import logging
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -34,6 +35,10 @@ VISIBLE_AFTER_S = 1.0
 
 MAX_CONCURRENT_WRITES = 32
 """Values of a lost bucket that are stored again concurrently."""
+
+DELETION_TTL_S = 3600
+"""How long the bucket and the nodes keep a deletion. A node that was away for longer looks for what
+the bucket does not have any more."""
 
 FORMER_HEADER = "Holdfast-Former"
 """The header of a value that is from a lost bucket: which one, and its revision there."""
@@ -81,6 +86,14 @@ class DesiredState:
         self._bucket: KeyBucket | None = None
         self._values: dict[str, tuple[int, bytes]] = {}
         """Revision and value of each device; the value is empty if it was deleted."""
+        self._latest = 0
+        """The latest revision that is known."""
+        self._deleted: dict[str, float] = {}
+        """When this node has learned of each deletion, the oldest first."""
+        self._doubted: set[str] = set()
+        """The devices that the bucket may not have any more, as the deletion has ended there."""
+        self._is_shown = False
+        """Whether the bucket has shown all that it has, since it is followed."""
         self._made_at = ""
         self._former: dict[str, _Former] = {}
         """The values of a lost bucket that are not stored again yet."""
@@ -101,17 +114,20 @@ class DesiredState:
         """
         if self._bucket is None or self._bucket.client is not client:
             self._bucket = KeyBucket(client, self.bucket, TIMEOUT_S, TIMEOUT_S)
-        found = await self._bucket.make(3, self._latest)
+        found = await self._bucket.make(3, self._latest, allow_msg_ttl=True)
+        if not found.config.allow_msg_ttl:  # Before deletions had an end.
+            await self._bucket.allow_ttls(found.config)
         self._identify(str(found.created), found.state.last_seq)
         await self.agree(terms, is_in_force, may_replace=has_joined)
         await self._restore()
         with contextlib.suppress(Error):
             await self._bucket.unfollow()
-        await self._bucket.follow_keys(f"{DEVICE}>", self._on_message, self.is_read.set)
+        self._doubted, self._is_shown = set(self._values), False
+        await self._bucket.follow_keys(f"{DEVICE}>", self._on_message, self._on_shown)
 
-    @property
-    def _latest(self) -> int:
-        return max((revision for revision, _ in self._values.values()), default=0)
+    def _on_shown(self) -> None:
+        self._is_shown = True
+        self.is_read.set()
 
     def _identify(self, made_at: str, last: int) -> None:
         """Notes that the bucket is another one, or was set back, and that its values are lost."""
@@ -122,7 +138,7 @@ class DesiredState:
             device: _Former(before, revision, value)
             for device, (revision, value) in self._values.items()
         }
-        self._values = {}
+        self._values, self._deleted, self._latest = {}, {}, 0
         self._on_loss()
         known = sum(bool(former.value) for former in self._former.values())
         fields = {"fleet": self._fleet, "bucket": self.bucket, "devices": known}
@@ -223,26 +239,55 @@ class DesiredState:
         Raises `Outdated` and errors of nats-py.
         """
         value, made_at = b"" if desired is None else msgspec.json.encode(desired), self._made_at
-        stored = await self._put(DEVICE + _token(device), value, revision)
+        try:
+            stored = await self._put(DEVICE + _token(device), value, revision)
+        except Outdated:
+            self._doubted.add(device)
+            raise
         if made_at != self._made_at:
             raise Outdated(device)
         self._learn(device, stored, value)
         return stored
 
     async def read(self, device: str) -> None:
-        """Reads the value of a device, if it is newer than the known one.
+        """Reads the value of a device, if it is another one than the known one.
 
         Raises errors of nats-py.
         """
         assert self._bucket is not None, "it is open"
-        found = await self._bucket.newer(DEVICE + _token(device), self.revision(device))
+        key, known = DEVICE + _token(device), self.revision(device)
+        is_doubted = device in self._doubted
+        # A value may be large, so it is not read again without need.
+        found = await (self._bucket.last(key) if is_doubted else self._bucket.newer(key, known))
         if found is not None:
             self._learn(device, found.seq or 0, found.data or b"")
+        elif is_doubted and self.revision(device) == known:
+            self._forget(device)
+
+    async def forget_ended(self) -> None:
+        """Forgets the devices whose deletion has ended. Raises errors of nats-py."""
+        if self._is_shown:
+            for device in tuple(self._doubted):
+                await self.read(device)
+        before = time.monotonic() - DELETION_TTL_S
+        for device in [device for device, at in self._deleted.items() if at < before]:
+            self._forget(device)
+
+    def _forget(self, device: str) -> None:
+        self._values.pop(device, None)
+        self._deleted.pop(device, None)
+        self._doubted.discard(device)
+        self._on_change(device)
 
     def _learn(self, device: str, revision: int, value: bytes) -> bool:
+        self._doubted.discard(device)
         if revision <= self.revision(device):
             return False
         self._values[device] = (revision, self._checked(device, value))
+        self._latest = max(self._latest, revision)
+        self._deleted.pop(device, None)
+        if not value:
+            self._deleted[device] = time.monotonic()
         return True
 
     def _checked(self, device: str, value: bytes) -> bytes:
@@ -274,7 +319,7 @@ class DesiredState:
         assert self._bucket is not None, "it is open"
         headers = dict(more or {})
         if not value:
-            headers["KV-Operation"] = "DEL"
+            headers |= {"KV-Operation": "DEL", "Nats-TTL": f"{DELETION_TTL_S}s"}
         return await self._bucket.publish(key, value, revision, headers)
 
 

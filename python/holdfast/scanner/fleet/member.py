@@ -176,6 +176,7 @@ class FleetMember(Placement):
             if not self._has_new_client.is_set():
                 with contextlib.suppress(Error, OSError):
                     if await self.desired.is_followed():
+                        await self.desired.forget_ended()
                         continue
             self._has_new_client.clear()
             try:
@@ -258,6 +259,8 @@ class FleetMember(Placement):
             self._renewed.pop(device, None)
             return refused
         self._applied[device] = revision
+        if not revision:  # Its deletion has ended.
+            del self._applied[device]
         self._note_renewed(device, times)
         return None
 
