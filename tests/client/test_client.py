@@ -1580,6 +1580,31 @@ def test_a_copy_that_fails_says_so_once(url: str, monkeypatch: pytest.MonkeyPatc
     assert reported == []
 
 
+@pytest.fixture
+def no_collector() -> Iterator[None]:
+    """Cycles stay, with what they have open."""
+    gc.collect()
+    gc.disable()
+    yield
+    gc.enable()
+    with warnings.catch_warnings(action="ignore"):  # asyncio warns of its transports.
+        gc.collect()
+
+
+@pytest.mark.usefixtures("no_collector")
+def test_a_client_leaves_no_connection_in_an_event_loop_that_is_closed() -> None:
+    # A device for one connection at a time.
+    with Stream("tcp", in_turn=True) as device:
+        plc = holdfast.Client(device.url, timeout=wire.DEADLINE)
+        for _ in range(2):
+            with asyncio.Runner() as runner:
+                assert runner.run(plc.read_holding_registers(7, 1)) == [7]
+        assert device.connections == 2
+        with pytest.warns(ResourceWarning, match=f"unclosed client of {device.url}"):
+            del plc
+        wire.until(lambda: not device.is_connected, "it is closed")
+
+
 @pytest.mark.parametrize("is_connected", [True, False])
 def test_a_client_that_nobody_has_any_more_is_closed_in_its_event_loop(is_connected: bool) -> None:
     def forget(clients: list[holdfast.Client]) -> None:

@@ -277,12 +277,13 @@ class AsyncConnection:
 
     def __del__(self, _warn: Callable[..., None] = warnings.warn) -> None:
         last = self._last
-        if last is None or not last.is_connected or last.loop.is_closed():
+        if last is None or not last.is_connected:
             return
         _warn(f"unclosed client of {self._target}", ResourceWarning, source=self)
-        # The loop may be closed by its thread meanwhile.
-        with contextlib.suppress(RuntimeError):
+        try:
             last.loop.call_soon_threadsafe(last.abandon)
+        except RuntimeError:  # The loop is closed.
+            last.close_socket()
 
     @property
     def late(self) -> int:
@@ -301,6 +302,8 @@ class AsyncConnection:
             return last
         if last is not None and last.in_use:
             _check_closed(last.loop)
+        if last is not None and last.loop.is_closed():
+            last.close_socket()
         # An object for each loop: calls that a closed loop has left behind may end at any time,
         # and must not give back places of the new one.
         late = (0, 0.0) if last is None else (last.late, last.longest_late)
@@ -403,6 +406,12 @@ class _LoopConnection:
             self._connecting.add_done_callback(lambda _: self.abandon())
         elif self._protocol is not None:
             self._protocol.close()
+
+    def close_socket(self) -> None:
+        """Closes the connection of a loop that is closed, and can't do it any more. Otherwise the
+        device would have it until Python finds the cycle that the transport is in."""
+        if self._socket is not None:
+            self._socket.close()
 
     @property
     def is_connected(self) -> bool:
