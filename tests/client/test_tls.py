@@ -21,8 +21,10 @@ from pymodbus.server import ModbusTlsServer
 
 import holdfast
 from holdfast import _core
+from holdfast.client.async_transports import _Protocol
 from holdfast.client.endpoint import endpoint
 from holdfast.client.url import parse
+from holdfast.net import event_loop
 from support import wire
 from support.cli import answer, done, failure, usage_error
 from support.faces import FACES, dialling, run
@@ -31,7 +33,7 @@ from support.pymodbus_server import Pymodbus, tour, unit_1
 from support.secured import VERSIONS, Authority, Relay, context
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from support.faces import Dial, Face
@@ -578,6 +580,38 @@ def test_a_client_says_that_it_goes(
             client.close()
         wire.until(lambda: relay.ends == ["in order"] * 2, "both connections have ended")
         assert relay.connections == 2
+
+
+@pytest.mark.parametrize("loop_factory", [asyncio.new_event_loop, event_loop.fastest])
+@pytest.mark.parametrize("at", ["connection_made", "_greet"])
+def test_a_client_may_be_closed_in_the_turn_in_which_it_has_connected(
+    loop_factory: Callable[[], asyncio.AbstractEventLoop],
+    at: str,
+    device: Address,
+    authority: Authority,
+    plc: Owner,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    goes_on = getattr(_Protocol, at)
+
+    async def main() -> None:
+        closing: list[asyncio.Task[None]] = []
+
+        def close(protocol: _Protocol, *args: Any) -> None:
+            if args or protocol.core.is_ready:
+                closing.append(asyncio.create_task(client.close()))
+            goes_on(protocol, *args)
+
+        monkeypatch.setattr(_Protocol, at, close)
+        client = holdfast.Client(relay.url(ca=authority.ca), timeout=wire.DEADLINE)
+        with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+            await client.read_holding_registers(0, 3)
+        [closed] = closing
+        await closed
+        await asyncio.to_thread(wire.until, lambda: relay.has_ended, "it is closed")
+
+    with Relay(device, context(plc)) as relay, asyncio.Runner(loop_factory=loop_factory) as runner:
+        runner.run(main())
 
 
 def test_calls_that_wait_end_when_the_client_is_closed(

@@ -154,6 +154,12 @@ class Relay:
         self._listening.close()
 
     @property
+    def has_ended(self) -> bool:
+        """Whether there were connections, and all have ended."""
+        with self._lock:
+            return self.connections > 0 and not self._open
+
+    @property
     def address(self) -> tuple[str, int]:
         host, port = self._listening.getsockname()
         return host, port

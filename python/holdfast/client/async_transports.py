@@ -495,11 +495,12 @@ class _LoopConnection:
                         raise  # Of this side, not of the system.
                     raise connect_failed(target, error) from error
                 await protocol.ready
-        except TimeoutError:
-            raise self._not_in_time(timeout) from None
-        finally:
-            if not protocol.is_ready:
-                protocol.close()
+        except BaseException as error:
+            # Also if it is ready: nobody will use it.
+            protocol.close()
+            if isinstance(error, TimeoutError):
+                raise self._not_in_time(timeout) from None
+            raise
         return protocol
 
     def _not_in_time(self, timeout: float) -> RequestTimeout:
@@ -560,7 +561,7 @@ class _Protocol(asyncio.BaseProtocol):
 
     def _changed(self) -> None:
         """Continues the handshake, and handles the end of the connection."""
-        if not self.ready.done():
+        if not self.ready.done() and self.core.closed is None:
             self._greet()
         closed = self.core.closed
         if closed is not None:
@@ -583,7 +584,9 @@ class _Protocol(asyncio.BaseProtocol):
         if transport is not None:
             self._here.lost(self)
             if not transport.is_closing():
-                self.core.flush()
+                # One of uvloop does not say so if it was closed before `create_connection` ended.
+                with contextlib.suppress(RuntimeError):
+                    self.core.flush()
             self.core.detach()
             transport.abort()
 
