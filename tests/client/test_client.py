@@ -21,6 +21,7 @@ import time
 import warnings
 from array import array
 from collections import UserList, deque
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -1455,11 +1456,12 @@ def test_a_call_that_waits_to_be_sent_again_ends_with_the_client() -> None:
     run(main)
 
 
-def test_whoever_closes_a_client_may_be_cancelled() -> None:
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
+def test_whoever_closes_a_client_may_be_cancelled(kind: str) -> None:
     async def main() -> None:
         problems: list[dict[str, Any]] = []
         asyncio.get_running_loop().set_exception_handler(lambda _, told: problems.append(told))
-        with Stream("tcp") as device:
+        with Stream(kind) as device:
             plc = holdfast.Client(device.url, timeout=wire.DEADLINE)
             await plc.read_coils(0, 1)
             task = asyncio.create_task(plc.close())
@@ -1469,6 +1471,44 @@ def test_whoever_closes_a_client_may_be_cancelled() -> None:
             assert await plc.read_holding_registers(7, 1) == [7]
             await plc.close()
         assert problems == []
+
+    run(main)
+
+
+def test_an_event_loop_may_end_before_a_close_that_was_cancelled(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async def main(device: Stream) -> None:
+        plc = holdfast.Client(device.url, timeout=10 * wire.DEADLINE)
+        writing = asyncio.create_task(plc.write_register(0, 1))
+        await asyncio.to_thread(device.await_requests, 1)
+        closing = asyncio.create_task(plc.close())
+        await asyncio.sleep(0)
+        await cancelled(closing)
+        await cancelled(writing)
+
+    with Stream("rtu+tcp", silent) as device:
+        asyncio.run(main(device))
+        wire.until(lambda: not device.is_connected, "it is closed")
+    assert caplog.records == []
+
+
+def test_a_client_is_closed_while_the_threads_of_the_application_are_busy() -> None:
+    async def main() -> None:
+        loop, go_on = asyncio.get_running_loop(), threading.Event()
+        loop.set_default_executor(ThreadPoolExecutor(1))
+        with Stream("rtu+tcp", silent) as device:
+            plc = holdfast.Client(device.url, timeout=10 * wire.DEADLINE)
+            writing = asyncio.create_task(plc.write_register(0, 1))
+            await asyncio.to_thread(device.await_requests, 1)
+            busy = loop.run_in_executor(None, go_on.wait)
+            try:
+                await asyncio.wait_for(plc.close(), wire.DEADLINE)
+            finally:
+                go_on.set()
+                await busy
+            with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                await writing
 
     run(main)
 

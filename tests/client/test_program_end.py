@@ -39,6 +39,58 @@ has_read.wait()
 """
 
 
+AFTER_THE_MAIN_THREAD = """
+import asyncio, sys, threading, holdfast
+async def main():
+    async with holdfast.Client(sys.argv[1]) as plc:
+        assert await plc.read_holding_registers(7, 1) == [7]
+    with holdfast.Poller() as poller:
+        poller.add(sys.argv[1], {"x": ("holding_registers", 7)})
+        async for batch in poller:
+            assert [reading.value for reading in batch] == [7]
+            print("read")
+            break
+def run():
+    threading.main_thread().join()
+    asyncio.run(main())
+threading.Thread(target=run).start()
+"""
+
+
+DURING_THE_END_OF_THE_MAIN_THREAD = """
+import asyncio, sys, threading, holdfast
+has_read = threading.Event()
+async def main():
+    poller = holdfast.Poller()
+    poller.add(sys.argv[1], {"x": ("holding_registers", 7)}, interval=0.01)
+    async with holdfast.Client(sys.argv[1]) as plc:
+        async for _ in poller:
+            await plc.read_holding_registers(7, 1)
+            has_read.set()
+            if not threading.main_thread().is_alive():
+                break
+    print("read")
+threading.Thread(target=lambda: asyncio.run(main())).start()
+has_read.wait()
+"""
+
+
+AFTER_THE_END = """
+import asyncio, atexit, sys
+async def read():
+    return await plc.read_holding_registers(7, 1)
+@atexit.register
+def read_too_late():
+    try:
+        asyncio.run(read())
+    except RuntimeError as error:
+        print(error)
+import holdfast
+plc = holdfast.Client(sys.argv[1])
+assert asyncio.run(read()) == [7]
+"""
+
+
 CANCELLED = """
 import asyncio, sys, holdfast
 async def main():
@@ -90,6 +142,11 @@ call = lambda: plc.call(Request.read("coils", 0, 1), 1, 90, has_begun.set)
 """
 
 
+def ended(program: str, url: str) -> subprocess.CompletedProcess[bytes]:
+    command = [sys.executable, "-c", program, url]
+    return subprocess.run(command, capture_output=True, timeout=wire.DEADLINE, check=False)
+
+
 @pytest.mark.parametrize("device", [Stream("rtu+tcp", silent), Udp(silent)], ids=["rtu+tcp", "udp"])
 def test_a_program_does_not_wait_for_a_call_that_was_cancelled(device: ScriptedDevice) -> None:
     with device:
@@ -103,14 +160,28 @@ def test_a_program_does_not_wait_for_a_call_that_was_cancelled(device: ScriptedD
     assert (program.returncode, stderr) == (0, b"")
 
 
+@pytest.mark.parametrize("program", [AFTER_THE_MAIN_THREAD, DURING_THE_END_OF_THE_MAIN_THREAD])
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp", "udp"])
+def test_a_thread_reads_on_when_the_main_thread_has_ended(kind: str, program: str) -> None:
+    with Udp() if kind == "udp" else Stream(kind) as device:
+        end = ended(program, device.url)
+    assert (end.stdout, end.stderr, end.returncode) == (b"read\n", b"", 0)
+
+
+def test_a_client_without_a_thread_at_the_end_of_the_program_says_so() -> None:
+    with Stream("rtu+tcp") as device:
+        end = ended(AFTER_THE_END, device.url)
+    assert (end.stderr, end.returncode) == (b"", 0)
+    assert end.stdout == b"the program ends: a client can't start its thread\n"
+
+
 @pytest.mark.parametrize("program", [IN_A_DAEMON_THREAD, POLLED_IN_A_DAEMON_THREAD])
-def test_a_program_ends_while_its_event_loop_reads_in_a_daemon_thread(program: str) -> None:
-    with Stream("tcp") as device:
-        command = [sys.executable, "-c", program, device.url]
-        ends = [
-            subprocess.run(command, capture_output=True, timeout=wire.DEADLINE, check=False)
-            for _ in range(8)
-        ]
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
+def test_a_program_ends_while_its_event_loop_reads_in_a_daemon_thread(
+    kind: str, program: str
+) -> None:
+    with Stream(kind) as device:
+        ends = [ended(program, device.url) for _ in range(8)]
     assert [(end.returncode, end.stderr) for end in ends] == [(0, b"")] * 8
 
 

@@ -27,10 +27,7 @@ PRODUCT = ROOT / "python" / "holdfast"
 UNDOCUMENTED = ("nats.aio.transport", "nats.protocol", "ruamel.yaml.scanner")
 """Modules that nothing in their package's documentation speaks of."""
 
-VARIABLES = {
-    "client/program_end.py": {"threading": "threading"},
-    "net/nats/batch.py": {"client": "nats.aio.client.Client"},
-}
+VARIABLES = {"net/nats/batch.py": {"client": "nats.aio.client.Client"}}
 """What variables hold that a file takes private names of, by their names."""
 
 DERIVED = {"BrokerClient": "paho.mqtt.client.Client"}

@@ -16,7 +16,6 @@ import copy
 import socket
 import warnings
 from collections import deque
-from concurrent.futures import ThreadPoolExecutor, wait
 from math import ceil, inf
 from threading import Event
 from typing import TYPE_CHECKING, Any, Protocol, cast
@@ -28,6 +27,7 @@ from holdfast.client.fork import renew_in_children
 from holdfast.client.program_end import end_at_exit, sleep_at_end
 from holdfast.client.tcp_connect import addresses, connected, limit_resends
 from holdfast.errors import ConnectFailed, ConnectionLost, ModbusError, RequestTimeout
+from holdfast.runtime.own_thread import OwnThread
 from holdfast.runtime.text import os_error_text
 
 if TYPE_CHECKING:
@@ -38,9 +38,6 @@ if TYPE_CHECKING:
     from holdfast.client.url import NetworkTarget, Target
 
 CLOSED = "connection lost: closed by this side"
-
-END_CALL_INTERVAL_S = 0.2
-"""Seconds after which a call of a thread is ended again that had not begun before."""
 
 
 class AsyncTransport(Protocol):
@@ -80,7 +77,7 @@ class ThreadedConnection:
     """A transport with one request at a time, in a thread of its own, and in one event loop at a
     time."""
 
-    _executor: ThreadPoolExecutor | None = None
+    _thread: _CallThread | None = None
     _loop: asyncio.AbstractEventLoop | None = None
     """The event loop that uses the thread."""
 
@@ -93,7 +90,7 @@ class ThreadedConnection:
 
     def _connect_anew(self) -> None:
         self._core = BlockingClient(self._endpoint, self._trace)
-        self._executor, self._closed = None, Event()
+        self._thread = None
 
     async def call(
         self,
@@ -104,72 +101,35 @@ class ThreadedConnection:
     ) -> Any:
         """Sends a request after the calls before it, and waits for the result.
 
-        Raises `RuntimeError` while the client is in use in another event loop.
+        Raises `RuntimeError` while the client is in use in another event loop, and if the program
+        ends.
         """
-        loop = self._loop = self._here()
+        self._loop = self._here()
         if note_sent is not None:
             note_sent()  # The thread may send it at any time.
-        if self._executor is None:
-            self._executor, self._closed = ThreadPoolExecutor(1, "holdfast-client"), Event()
-            end_at_exit(self)
-        core, closed, cancelled = self._core, self._closed, Event()
-
-        # Without a reference to this object, which nobody may have any more after a cancellation.
-        def carry() -> Any:
-            # The client was closed, and possibly used again, while this call waited for its turn.
-            if closed.is_set():
-                raise _closed_before_sent()
-            return core.call(request, unit, timeout, cancelled.is_set)
-
-        try:
-            return await loop.run_in_executor(self._executor, carry)
-        except asyncio.CancelledError:
-            cancelled.set()
-            raise
+        if self._thread is None or self._thread.is_closed:  # The end of the program closes it too.
+            self._thread = _CallThread(self._core)
+        return await self._thread.carry(request, unit, timeout)
 
     async def close(self) -> None:
         """Closes the connection; the current call and waiting calls fail."""
         self._here()
-        executor = self._leave()
-        if executor is not None:
-            await asyncio.to_thread(self._end, executor)
-
-    def end(self) -> None:
-        """As `close`, without an event loop."""
-        executor = self._leave()
-        if executor is not None:
-            self._end(executor)
+        thread, self._thread = self._thread, None
+        if thread is not None:
+            thread.close()
+            await asyncio.wrap_future(thread.ended)
 
     def _here(self) -> asyncio.AbstractEventLoop:
         """This loop, which may use the connection."""
         loop = asyncio.get_running_loop()
-        if self._executor is not None and self._loop is not loop:
+        if self._thread is not None and self._loop is not loop:
             _check_closed(self._loop)
         return loop
 
-    def _leave(self) -> ThreadPoolExecutor | None:
-        """The thread, if there is one: calls that wait for it fail, and the next has a new one."""
-        self._closed.set()
-        executor, self._executor = self._executor, None
-        return executor
-
-    def _end(self, executor: ThreadPoolExecutor) -> None:
-        closed = executor.submit(self._core.close)
-        while not closed.done():
-            # A call may begin only now.
-            self._core.end_call()
-            wait([closed], END_CALL_INTERVAL_S)
-        executor.shutdown()
-
     def __del__(self, _warn: Callable[..., None] = warnings.warn) -> None:
-        if self._executor is None:
-            return
-        _warn(f"unclosed client of {self._target}", ResourceWarning, source=self)
-        executor = self._leave()
-        assert executor is not None
-        # All its calls are cancelled: only one that was sent is left.
-        self._core.end_call()
-        executor.shutdown(wait=False)
+        if self._thread is not None:
+            _warn(f"unclosed client of {self._target}", ResourceWarning, source=self)
+            self._thread.close()
 
     @property
     def late(self) -> int:
@@ -180,6 +140,48 @@ class ThreadedConnection:
     def longest_late(self) -> float:
         """How many seconds the slowest of them took; 0 if there were none."""
         return self._core.longest_late
+
+
+class _CallThread(OwnThread):
+    """The thread of a `ThreadedConnection`, until that is closed. Its calls have a reference to
+    this, and not to that, which nobody may have any more after a cancellation."""
+
+    def __init__(self, core: BlockingClient) -> None:
+        super().__init__("holdfast-client")
+        self._core = core
+        self.is_closed = False
+        self.start()
+        end_at_exit(self)
+
+    async def carry(self, request: Request, unit: int, timeout: float) -> Any:
+        """Sends a request after the calls before it, and waits for the result."""
+        cancelled = Event()
+
+        def is_over() -> bool:
+            return cancelled.is_set() or self.is_closed
+
+        def call() -> Any:
+            if self.is_closed:  # While this call waited for its turn.
+                raise _closed_before_sent()
+            return self._core.call(request, unit, timeout, is_over)
+
+        try:
+            return await self.call(call)
+        except asyncio.CancelledError:
+            cancelled.set()
+            raise
+
+    def close(self) -> None:
+        """Lets the thread end: its calls fail, and it closes the connection."""
+        if not self.is_closed:
+            # First: `end_call` ends no call that begins only now.
+            self.is_closed = True
+            self._core.end_call()
+            self.submit(self._close)
+            self.end()
+
+    def _close(self) -> None:
+        self._core.close()
 
 
 class AsyncConnection:

@@ -1,20 +1,16 @@
-"""Ends what would keep or abort a program that ends.
+"""Ends what would abort a program that ends: when all its threads have ended but daemons.
 
-The interpreter waits for the threads of clients: their calls end.
-
-The event loops of daemon threads sleep. Up to Python 3.13, the interpreter ends such a thread
-wherever it runs Python code. Where the native core has called that code, as for every reply, this
-would abort the process.
+Up to Python 3.13, the interpreter ends a daemon thread wherever it runs Python code. Where the
+native core has called that code, as for every reply, this would abort the process. So the threads
+of clients end, and the event loops of daemon threads sleep.
 """
 
 from __future__ import annotations
 
 import atexit
-import concurrent.futures.thread  # noqa: F401 - registers its hook before that of this module
 import contextlib
 import os
 import sys
-import threading
 import time
 from threading import Event
 from typing import TYPE_CHECKING, Protocol
@@ -22,16 +18,21 @@ from weakref import WeakSet
 
 if TYPE_CHECKING:
     from asyncio import AbstractEventLoop
+    from concurrent.futures import Future
 
 SLEEP_S = 1.0
 """Longer than the rest of the end takes. Not for ever: a later hook may wait for the loop."""
 
 
 class Ending(Protocol):
-    """What has a thread that the interpreter waits for."""
+    """A daemon thread with native calls."""
 
-    def end(self) -> None:
-        """Ends the thread, and what it does."""
+    @property
+    def ended(self) -> Future[None]:
+        """Done when the thread has ended."""
+
+    def close(self) -> None:
+        """Lets the thread end, and what it does."""
 
 
 _ends = Event()
@@ -40,18 +41,15 @@ _loops: WeakSet[AbstractEventLoop] = WeakSet()
 
 
 def end_at_exit(threaded: Ending) -> None:
-    """Ends it if the program ends before its owner has closed it."""
+    """Ends it before the program ends. Raises `RuntimeError` if it ends already."""
     _threaded.add(threaded)
+    if _ends.is_set():  # After the addition: `_end` sees it, or this sees that the end has begun.
+        raise RuntimeError("the program ends: a client can't start its thread")
 
 
 def sleep_at_end(loop: AbstractEventLoop) -> None:
     """Lets a loop sleep if it still runs when the program ends."""
     _loops.add(loop)
-
-
-def has_begun() -> bool:
-    """Whether the program ends, so that executors may take nothing more."""
-    return _ends.is_set()
 
 
 def _sleep(sleeps: Event) -> None:
@@ -60,6 +58,17 @@ def _sleep(sleeps: Event) -> None:
 
 
 def _end() -> None:
+    _ends.set()
+    threaded = list(_threaded)
+    for each in threaded:
+        each.close()
+    for each in threaded:
+        each.ended.result()
+    if sys.version_info < (3, 14):
+        _let_loops_sleep()
+
+
+def _let_loops_sleep() -> None:
     for loop in list(_loops):
         if loop.is_running():
             sleeps = Event()
@@ -68,16 +77,12 @@ def _end() -> None:
                 sleeps.wait(SLEEP_S)
 
 
-def _end_threads() -> None:
-    _ends.set()
-    for threaded in list(_threaded):
-        threaded.end()
+def _forget() -> None:
+    """A child does not have the other threads."""
+    _threaded.clear()
+    _loops.clear()
 
 
-# The hooks of `atexit` run after the interpreter has waited for all threads. These run before, the
-# last first: that of `concurrent.futures` waits for its threads.
-threading._register_atexit(_end_threads)  # type: ignore[attr-defined]
-if sys.version_info < (3, 14):
-    atexit.register(_end)
+atexit.register(_end)
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_loops.clear)  # A child does not have the other threads.
+    os.register_at_fork(after_in_child=_forget)

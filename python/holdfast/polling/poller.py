@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 from holdfast import _core
@@ -30,9 +31,10 @@ from holdfast.tags.read_gap import DEFAULT_MAX_GAP
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterator
-    from concurrent.futures import Future, ThreadPoolExecutor
+    from concurrent.futures import Future
 
     from holdfast.polling.readings import DevicePoll
+    from holdfast.runtime.own_thread import OwnThread
 
 TAGS = "{'flow': ('input_registers', 0, 'float32')}"
 """An example, for errors."""
@@ -89,7 +91,7 @@ class Poller:
         """The options of each connection, and its devices."""
         self._names = itertools.count(1)
         self._generations = itertools.count(1)
-        self._executor: ThreadPoolExecutor | None = None
+        self._thread: OwnThread | None = None
         self._pending: Future[Batch | None] | None = None
         """Of no event loop: the next iteration may be in another one."""
         self._has_ended = False
@@ -273,20 +275,14 @@ class Poller:
 
     async def __aiter__(self) -> AsyncIterator[Batch]:
         import asyncio  # Who iterates over it without a loop does not need it.
-        from concurrent.futures import ThreadPoolExecutor
 
-        from holdfast.client import program_end
+        from holdfast.runtime.own_thread import OwnThread
 
-        if self._executor is None:
-            self._executor = ThreadPoolExecutor(1, "holdfast-poller")
+        if self._thread is None:
+            self._thread = OwnThread("holdfast-poller")
         while True:
             if self._pending is None or self._pending.cancelled():
-                try:
-                    self._pending = self._executor.submit(self.take, ABANDON_CHECK_S)
-                except RuntimeError:
-                    if not program_end.has_begun():
-                        raise
-                    return  # A daemon thread runs this event loop.
+                self._pending = self._thread.submit(partial(self.take, ABANDON_CHECK_S))
             # One that runs can't be cancelled: its batch is the first of the next iteration.
             batch = await asyncio.wrap_future(self._pending)
             self._pending = None
