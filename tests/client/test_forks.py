@@ -45,6 +45,36 @@ print("released", flush=True)
 waiting.join()
 """
 
+FORK_WITH_A_POLLER = """
+import asyncio, os, sys, holdfast
+poller = holdfast.Poller()
+name = poller.add(sys.argv[1], {"x": ("holding_registers", 0)})
+async def first():
+    async for batch in poller:
+        return batch
+assert poller.take() is not None
+child = os.fork()
+if child:
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    poller.write(name, "x", 1)
+    poller.close()
+else:
+    for use in (
+        lambda: poller.add(sys.argv[1], {"y": ("coils", 0)}),
+        lambda: poller.write(name, "x", 1),
+        lambda: poller.remove(name),
+        lambda: next(iter(poller)),
+        lambda: asyncio.run(first()),
+        poller.counters,
+        poller.take,
+    ):
+        try:
+            use()
+        except RuntimeError as error:
+            print(error)
+    poller.close()
+"""
+
 
 def python(script: str, *words: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
@@ -76,3 +106,14 @@ def test_a_child_that_is_forked_during_a_call_of_another_thread_has_its_own() ->
             parent.stdin.flush()
             assert parent.stdout.readline() == "released\n"
             parent.kill()
+
+
+def test_a_poller_says_in_a_forked_child_that_it_is_of_its_parent() -> None:
+    with Stream("tcp") as device, python(FORK_WITH_A_POLLER, device.url) as parent:
+        try:
+            output, errors = parent.communicate(timeout=wire.DEADLINE)
+        finally:
+            parent.kill()
+    assert (parent.returncode, errors) == (0, "")
+    said = "this poller works in the process that has made it, not in a child"
+    assert output.splitlines() == [said] * 7

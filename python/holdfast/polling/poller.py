@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -74,6 +75,9 @@ class Poller:
     polls of other devices, after its first. If nobody takes batches, the oldest polls are dropped
     and counted.
 
+    A forked child does not have the thread: `close` does nothing there, and the other methods raise
+    `RuntimeError`.
+
     Raises `ValueError` or `TypeError` for a `gather` that is no time.
     """
 
@@ -91,6 +95,7 @@ class Poller:
         """The options of each connection, and its devices."""
         self._names = itertools.count(1)
         self._generations = itertools.count(1)
+        self._process = os.getpid()
         self._thread: OwnThread | None = None
         self._pending: Future[Batch | None] | None = None
         """Of no event loop: the next iteration may be in another one."""
@@ -125,6 +130,7 @@ class Poller:
         address; `TypeError` if a time is not a number, or `tags` neither a tag list nor a mapping;
         `TagError` for an invalid tag, and `RuntimeError` after `close`.
         """
+        self._check_process()
         interval = checked_seconds("interval", interval, MAX_INTERVAL_S, MIN_INTERVAL_S)
         timeout = checked_seconds("timeout", timeout, MAX_TIMEOUT_S)
         target = parse(url)
@@ -180,6 +186,7 @@ class Poller:
 
         Raises `KeyError` for an unknown name.
         """
+        self._check_process()
         core_name = self._core_names.pop(name)
         del self._readers[core_name]
         place = self._places.pop(core_name)
@@ -196,6 +203,7 @@ class Poller:
         `ValueError` for a tag that is not `writable` or a value that does not fit, `WriteFailed`,
         also for a `remove` or `close` meanwhile, and `RuntimeError` after `close`.
         """
+        self._check_process()
         core_name = self._core_names[name]
         of = self._readers[core_name].named.get(tag)
         if of is None:
@@ -220,6 +228,7 @@ class Poller:
 
     def counters(self) -> dict[str, dict[str, Any]]:
         """Health and counters of each device, by name."""
+        self._check_process()
         counters = self._poller.counters()
         return {
             name: counters[core_name]
@@ -234,6 +243,7 @@ class Poller:
 
     def take(self, timeout: float | None = None) -> Batch | None:
         """The next batch; `None` if none comes within `timeout` seconds, or after `close`."""
+        self._check_process()
         end = None if timeout is None else time.monotonic() + timeout
         while True:
             left = SIGNAL_CHECK_S if end is None else min(SIGNAL_CHECK_S, end - time.monotonic())
@@ -281,6 +291,7 @@ class Poller:
         if self._thread is None:
             self._thread = OwnThread("holdfast-poller")
         while True:
+            self._check_process()
             if self._pending is None or self._pending.cancelled():
                 self._pending = self._thread.submit(partial(self.take, ABANDON_CHECK_S))
             # One that runs can't be cancelled: its batch is the first of the next iteration.
@@ -293,7 +304,14 @@ class Poller:
 
     def close(self) -> None:
         """Stops polling. Batches that wait can still be taken."""
-        self._poller.stop()
+        if os.getpid() == self._process:
+            self._poller.stop()
+
+    def _check_process(self) -> None:
+        """Raises `RuntimeError` in a forked child, which would wait for ever: also for a lock that
+        the thread held when the process was forked."""
+        if os.getpid() != self._process:
+            raise RuntimeError("this poller works in the process that has made it, not in a child")
 
     def __enter__(self) -> Self:
         return self
