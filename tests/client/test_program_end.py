@@ -118,7 +118,7 @@ class Device:
     def __del__(self, plc=plc):
         self.connection.sendall(b"x")
         self.connection.settimeout(0.01)
-        while True:
+        for _ in range(500):  # Of a thread that waited for the interpreter, nothing is left.
             plc.close()  # After the call.
             try:
                 if not self.connection.recv(260):
