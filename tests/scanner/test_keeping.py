@@ -15,7 +15,7 @@ import pytest
 from nats.js import JetStreamContext
 from nats.js.kv import KeyValue
 
-from holdfast.scanner.dialects import TENTACLE
+from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream import entries, restore, store
 from holdfast.scanner.jetstream.restore import StoredSubscriptions
 from holdfast.scanner.jetstream.store import BUCKET
@@ -23,7 +23,7 @@ from holdfast.scanner.messages.types import SubscribeRequest, TagRequest
 from holdfast.scanner.publish.publishers import Publishers
 from holdfast.scanner.subscriptions.key import SubscriptionKey
 from holdfast.scanner.subscriptions.registry import Registry
-from holdfast.scanner.subscriptions.request_rules import ScannerLimits
+from holdfast.scanner.subscriptions.request_rules import Rules, ScannerLimits
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import SMALL_PAYLOAD, Caller, leaving, logged, subscription, tag
@@ -212,8 +212,11 @@ def test_no_part_of_a_subscription_is_larger_than_a_message(
             ]
             request = subscription(server, *tags, scanRate=60_000)
             assert caller.request("modbus.subscribe", request)["success"]
-        assert len(subscriptions(caller)) > 1
+        stored = subscriptions(caller)
+        assert len(stored) > 1
         first.stop()
+        run_scanner(small_nats, allow=("192.0.2.0/24",)).stop()
+        assert subscriptions(caller) == stored
         second = run_scanner(small_nats)
         assert device(caller, "plc1")["tagCount"] == 200
         second.stop()
@@ -243,14 +246,85 @@ def test_a_tag_that_is_larger_than_a_message_costs_only_itself(
             assert answer["error"].startswith(reason)
         [found] = logged(caplog, "subscriptions_not_kept")
         assert (found["device"], found["subscriber"]) == ("plc1", "hmi")
+        # Others of the same subscriber are kept, and a request without tags changes nothing.
+        for more in (asked("c", ""), subscription(server, scanRate=60_000)):
+            assert caller.request("modbus.subscribe", more)["success"]
         other = asked("b", "") | {"subscriberId": "historian"}
         assert caller.request("modbus.subscribe", other)["success"]
         assert "modbus.subscription.historian.plc1.0" in subscriptions(caller)
-        assert device(caller, "plc1")["tagCount"] == 3
+        assert device(caller, "plc1")["tagCount"] == 4
+        assert caller.request("modbus.unsubscribe", leaving("a"))["success"]
         first.stop()
+        run_scanner(small_nats, allow=("192.0.2.0/24",)).stop()
         second = run_scanner(small_nats)
-        assert [each["id"] for each in device(caller, "plc1")["tags"]] == ["a", "b"]
+        assert tags_by_subscription(caller) == {
+            ("plc1", "hmi"): {"c"},
+            ("plc1", "historian"): {"b"},
+        }
         second.stop()
+
+
+def test_what_is_stored_stays_if_the_server_takes_less(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    tmp_path: Path,
+) -> None:
+    ask = own_caller.request
+    first = run_scanner(own_nats)
+    tags = [tag(f"t{number}", number, description="d" * 50) for number in range(100)]
+    large = tag("large", 0, description="ü" * (SMALL_PAYLOAD // 2))
+    for request in (
+        subscription(server, *tags),
+        subscription(server, large, deviceId="large"),
+    ):
+        assert ask("modbus.subscribe", request | {"scanRate": 60_000})["success"]
+    first.stop()
+    stored = subscriptions(own_caller)
+    assert len(stored) == 2
+
+    file = tmp_path / "small.conf"
+    file.write_text(f"max_payload: {SMALL_PAYLOAD}\n")
+    own_nats.restarted(*own_nats._options, "-c", str(file))
+    wanted = {
+        ("plc1", "hmi"): {each["id"] for each in tags[1:]},
+        ("large", "hmi"): {"large"},
+    }
+    with Caller(own_nats.url) as caller:
+        second = run_scanner(own_nats, allow=("192.0.2.0/24",))
+        assert caller.request("modbus.unsubscribe", leaving("unknown"))["success"]
+        assert subscriptions(caller) == stored
+        assert caller.request("modbus.unsubscribe", leaving("t0"))["success"]
+        second.stop()
+        assert stored_tags(caller) == wanted
+        third = run_scanner(own_nats)
+        found = caller.request("modbus.browse", b"")["devices"]
+        counts = {each["deviceId"]: each["tagCount"] for each in found}
+        assert counts == {"plc1": 99, "large": 1}
+        assert caller.request("modbus.unsubscribe", leaving("t1"))["success"]
+        # What is stored of a tag that is too large now is all that there is of it.
+        other_rate = subscription(server, deviceId="large", scanRate=50_000)
+        assert caller.request("modbus.subscribe", other_rate)["success"]
+        third.stop()
+        wanted["plc1", "hmi"].remove("t1")
+        assert stored_tags(caller) == wanted
+
+
+def test_a_pending_subscription_does_not_replace_another_one_with_the_same_key(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    first = run_scanner()
+    request = subscription(server, tag("a", 0), tag("b", 0), deviceId="pump 1", host="127.0.0.2")
+    assert caller.request("modbus.subscribe", request)["success"]
+    first.stop()
+    second = run_scanner(allow=("127.0.0.1/32",))
+    request = subscription(server, tag("c", 0), deviceId="pump_1", host="127.0.0.1")
+    assert caller.request("modbus.subscribe", request)["success"]
+    for id in ("a", "unknown"):
+        assert caller.request("modbus.unsubscribe", leaving(id, deviceId="pump 1"))["success"]
+        assert stored_tags(caller) == {("pump_1", "hmi"): {"c"}}
+    second.stop()
 
 
 def test_the_state_of_a_device_is_there_for_those_who_come_late(
@@ -455,14 +529,6 @@ def test_many_requests_at_once_are_all_kept(
     assert len(subscriptions(caller)) == 100
 
 
-def restart(nats: NatsServer, *options: str) -> tuple[str, ...]:
-    """Starts a server again with other options. Returns the former ones."""
-    nats.kill()
-    former, nats._options = nats._options, options
-    nats.start()
-    return former
-
-
 def tags_by_subscription(caller: Caller) -> dict[tuple[str, str], set[str]]:
     """Returns the tags of each subscription that is carried out, by device and subscriber."""
     return {
@@ -509,7 +575,7 @@ def test_what_is_requested_before_the_entries_are_read_is_on_top_of_them(
     add("shared", "b", "c", subscriberId="historian", **settings)
     first.stop()
 
-    jetstream = restart(own_nats)
+    jetstream = own_nats.restarted()
     scanner = run_scanner(own_nats)
     add("same", "a", "b", **settings)
     add("more", "c")
@@ -525,7 +591,7 @@ def test_what_is_requested_before_the_entries_are_read_is_on_top_of_them(
     if reloads:
         scanner.stop()
         scanner = run_scanner(own_nats, former=list(scanner.scanner.stored_requests()))
-    restart(own_nats, *jetstream)
+    own_nats.restarted(*jetstream)
     wanted = {
         ("same", "hmi"): {"a", "b"},
         ("more", "hmi"): {"a", "b", "c"},
@@ -560,10 +626,10 @@ def test_the_dialect_of_whole_subscriptions_replaces_what_is_not_read_yet(
     first = run_scanner(own_nats, dialect="tentacle-next")
     assert own_caller.request("modbus.subscribe", requests[0])["success"]
     first.stop()
-    jetstream = restart(own_nats)
+    jetstream = own_nats.restarted()
     run_scanner(own_nats, dialect="tentacle-next")
     assert own_caller.request("modbus.subscribe", requests[1])["success"]
-    restart(own_nats, *jetstream)
+    own_nats.restarted(*jetstream)
     wanted = {("d", "hmi"): {"b"}}
     wire.until(lambda: stored_tags(own_caller) == wanted, "the new one is stored")
     assert tags_by_subscription(own_caller) == wanted
@@ -641,6 +707,67 @@ def test_without_storage_a_request_adds_tags_to_a_refused_subscription_too(
     assert tags_by_subscription(caller) == {("plc1", "hmi"): {"b", "c"}}
 
 
+def test_without_storage_a_refused_subscription_does_not_end_a_later_one(
+    run_scanner: Run, caller: Caller, server: holdfast.Server
+) -> None:
+    request = subscription(server, tag("p", 1, profile="gone"))
+    former = [msgspec.json.decode(json.dumps(request), type=SubscribeRequest)]
+    scanner = run_scanner(keep_subscriptions=False, former=former)
+    assert caller.request("modbus.subscribe", subscription(server, tag("c", 3)))["success"]
+    for _ in range(2):
+        scanner.stop()
+        more = list(scanner.scanner.stored_requests())
+        scanner = run_scanner(keep_subscriptions=False, former=more)
+        assert tags_by_subscription(caller) == {("plc1", "hmi"): {"c"}}
+
+
+@pytest.mark.parametrize("adds", [False, True], ids=["", "adds"])
+def test_a_tag_of_a_pending_subscription_that_is_left_without_jetstream_stays_so(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    monkeypatch: pytest.MonkeyPatch,
+    adds: bool,
+) -> None:
+    monkeypatch.setattr(store, "MAX_RETRY_S", 0.1)
+    first = run_scanner(own_nats)
+    request = subscription(server, tag("a", 0), tag("b", 1), host="127.0.0.2")
+    assert own_caller.request("modbus.subscribe", request)["success"]
+    first.stop()
+    scanner = run_scanner(own_nats, allow=("127.0.0.1/32",))
+    assert tags_by_subscription(own_caller) == {}  # Answered when the entries are read.
+    jetstream = own_nats.restarted()
+    wire.until(lambda: scanner.serves, "it is connected again")
+    wanted = {("plc1", "hmi"): {"b"}}
+    left = ["a"]
+    if adds:
+        added = subscription(server, tag("c", 2), host="127.0.0.1")
+        assert own_caller.request("modbus.subscribe", added)["success"]
+        wanted, left = {("plc1", "hmi"): {"c"}}, ["a", "b"]
+    assert own_caller.request("modbus.unsubscribe", leaving(*left))["success"]
+    scanner.stop()
+    scanner = run_scanner(own_nats, former=list(scanner.scanner.stored_requests()))
+    own_nats.restarted(*jetstream)
+    wire.until(lambda: scanner.serves, "it is connected again")
+    wire.until(lambda: stored_tags(own_caller) == wanted, "what is left is stored")
+    assert tags_by_subscription(own_caller) == wanted
+
+
+def test_what_is_remembered_without_jetstream_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(restore, "MAX_CHANGED", 3)
+    monkeypatch.setattr(restore, "MAX_REMOVED_IDS", 5)
+    stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), Rules())
+    owners = [SubscriptionKey("plc1", f"s{number}") for number in range(5)]
+    for ids in (["a", "b"], ["b"], [f"{number}" for number in range(1, 100)]):
+        for owner in owners[:2]:
+            stored.unsubscribed(owner.removal(ids))
+    assert sum(len(each.ids or ()) for each in stored.removals(())) == 5
+    for owner in owners:
+        stored.unsubscribed(owner.removal())
+    assert len([*stored.removals(())]) == 3
+
+
 def test_what_is_unsubscribed_without_jetstream_stays_so_after_a_reload(
     run_scanner: Run,
     own_nats: NatsServer,
@@ -653,14 +780,14 @@ def test_what_is_unsubscribed_without_jetstream_stays_so_after_a_reload(
     for id in ("ended", "fewer"):
         request = subscription(server, tag("a", 0), tag("b", 1), deviceId=id)
         assert own_caller.request("modbus.subscribe", request)["success"]
-    jetstream = restart(own_nats)
+    jetstream = own_nats.restarted()
     wire.until(lambda: scanner.serves, "it is connected again")
     for ids, id in (("all", "ended"), (["a"], "fewer")):
         left = leaving(deviceId=id, tagIds=ids)
         assert own_caller.request("modbus.unsubscribe", left)["success"]
     scanner.stop()
     run_scanner(own_nats, former=list(scanner.scanner.stored_requests()))
-    restart(own_nats, *jetstream)
+    own_nats.restarted(*jetstream)
     wanted = {("fewer", "hmi"): {"b"}}
     wire.until(lambda: stored_tags(own_caller) == wanted, "what is left is stored")
     assert tags_by_subscription(own_caller) == wanted
@@ -686,7 +813,7 @@ def test_a_pending_subscription_that_a_caller_ends_meanwhile_is_not_carried_out(
             carried_out.append(request)
 
     async def run(*, ends: bool) -> None:
-        stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), TENTACLE)
+        stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), Rules())
         stored._device_host = stored._host = host = Host()  # type: ignore[assignment]
         tags = [TagRequest("a", 0, "holding", "int16")]
         value = msgspec.json.encode(SubscribeRequest("plc1", "hmi", tags, host="127.0.0.1"))
@@ -703,6 +830,52 @@ def test_a_pending_subscription_that_a_caller_ends_meanwhile_is_not_carried_out(
     assert len(carried_out) == 1
     asyncio.run(run(ends=True))
     assert len(carried_out) == 1
+
+
+def test_a_request_does_not_wait_for_all_parts_of_a_refused_subscription() -> None:
+    tried: list[SubscribeRequest] = []
+
+    class Host:
+        def __init__(self) -> None:
+            self._lock = asyncio.Lock()
+            self.has_begun = asyncio.Event()
+
+        def lock(self, _device: str) -> asyncio.Lock:
+            return self._lock
+
+        def is_entry(self, _owner: SubscriptionKey) -> bool:
+            return False
+
+        def give_up(self, _device: str, _reason: str) -> None: ...
+
+        async def restore(self, request: SubscribeRequest) -> None:
+            tried.append(request)
+            if len(tried) == 2:  # The first part, after the whole subscription.
+                self.has_begun.set()
+            for _ in range(5):
+                await asyncio.sleep(0)
+            raise Refused("no address")
+
+    async def run() -> None:
+        stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), Rules())
+        stored._device_host = stored._host = host = Host()  # type: ignore[assignment]
+        entries = []
+        for number in range(5):
+            tags = [TagRequest(f"t{number}", number, "holding", "int16")]
+            request = SubscribeRequest("plc1", "hmi", tags, host="plc.local")
+            key = f"modbus.subscription.hmi.plc1.{number}"
+            entries.append((key, msgspec.json.encode(request)))
+        stored._on_read(entries)
+        restoring = asyncio.create_task(stored._restore_all())
+        await asyncio.wait_for(host.has_begun.wait(), wire.DEADLINE)
+        async with host.lock("plc1"):
+            assert len(tried) == 2
+            # What this request changes is not carried out as it was stored.
+            stored.unsubscribed(SubscriptionKey("plc1", "hmi").removal(["t4"]))
+        await restoring
+        assert len(tried) == 2
+
+    asyncio.run(run())
 
 
 def test_a_device_that_gets_another_id_with_the_same_keys_stays_stored() -> None:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.scanner.jetstream import entries
+from holdfast.scanner.jetstream import entries, restore, store
+from holdfast.scanner.jetstream.store import BUCKET
 from holdfast.scanner.messages.types import SubscribeRequest, TagRequest
 from holdfast.tags import Tag, TagList
 from holdfast.tags.scale import RegisterScale
@@ -17,6 +18,7 @@ from support.nats_bus import leaving, logged, subscription, tag
 
 if TYPE_CHECKING:
     import holdfast
+    from support.brokers import NatsServer
     from support.nats_bus import Caller, Run, Running
 
 PROFILE = TagList(
@@ -231,14 +233,81 @@ def test_a_kept_subscription_has_the_tags_that_its_profile_has_now(
 def test_a_pending_subscription_that_leaves_a_tag_of_its_profile_has_not_all_of_it() -> None:
     tags = [TagRequest("a", 0, "holding", "int16", profile="p"), TagRequest("b", 1, "coil", "bool")]
     request = SubscribeRequest("plc1", "hmi", tags, profile="p")
-    [own_left] = entries.without([request], {"b"})
+    [own_left] = entries.without([request], {"b"}, {})
     assert (own_left.profile, own_left.tags) == ("p", tags[:1])
-    [profile_left] = entries.without([request], {"a"})
+    [profile_left] = entries.without([request], {"a"}, {})
     assert (profile_left.profile, profile_left.tags) == (None, tags[1:])
-    assert entries.without([request], {"a", "b"}) == []
+    assert entries.without([request], {"a", "b"}, {}) == []
     parts = [SubscribeRequest("plc1", "hmi", [each], profile="p") for each in tags]
-    [second_left] = entries.without(parts, {"a"})
+    [second_left] = entries.without(parts, {"a"}, {})
     assert (second_left.profile, second_left.tags) == (None, tags[1:])
+
+
+SMALL = TagList([Tag("a", "holding_registers", 0, writable=True, description="first")])
+GAINED = TagList([*SMALL, Tag("b", "holding_registers", 1)])
+
+
+@pytest.mark.parametrize("is_read", [True, False])
+def test_a_gained_tag_that_is_left_before_the_subscription_is_restored_does_not_return(
+    own_caller: Caller,
+    own_nats: NatsServer,
+    server: holdfast.Server,
+    run_scanner: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    is_read: bool,
+) -> None:
+    monkeypatch.setattr(store, "MAX_RETRY_S", 0.1)
+    request = subscription(server, profile="small")
+    first = run_scanner(own_nats, profiles={"small": SMALL}, writes="explicit")
+    assert own_caller.request("modbus.subscribe", request)["success"]
+    before = tags_of(own_caller)
+    first.stop()
+    options: dict[str, Any] = {"profiles": {"small": GAINED}, "writes": "explicit"}
+    if is_read:
+        second = run_scanner(own_nats, allow=("192.0.2.0/24",), **options)
+        assert own_caller.request("modbus.unsubscribe", leaving("b"))["success"]
+    else:
+        jetstream = own_nats.restarted()
+        second = run_scanner(own_nats, **options)
+        assert own_caller.request("modbus.subscribe", request)["success"]
+        assert own_caller.request("modbus.unsubscribe", leaving("b"))["success"]
+        own_nats.restarted(*jetstream)
+        wire.until(lambda: second.serves, "it is connected again")
+        key, unknown = "modbus.subscription.hmi.plc1.0", {"profile": ""}
+        wire.until(
+            lambda: "profile" not in own_caller.kept(BUCKET).get(key, unknown), "it is stored"
+        )
+    second.stop()
+    run_scanner(own_nats, **options)
+    assert tags_of(own_caller) == before
+
+
+def tags_of(caller: Caller) -> dict[str, dict[str, Any]]:
+    [found] = caller.request("modbus.browse", b"")["devices"]
+    return {tag["id"]: tag for tag in found["tags"]}
+
+
+def test_a_pending_subscription_with_another_profile_keeps_what_its_own_sets(
+    caller: Caller, server: holdfast.Server, run_scanner: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(restore, "MAX_RETRY_S", 0.1)
+    more: dict[str, Any] = {"profiles": {"small": SMALL, "heater": PROFILE}}
+    more |= {"prefix": "line2", "writes": "explicit"}
+
+    def tags() -> dict[str, dict[str, Any]]:
+        found = caller.request("line2.browse", b"")["devices"]
+        return {tag["id"]: tag for each in found for tag in each["tags"]}
+
+    first = run_scanner(**more)
+    request = subscription(server, profile="small", host="127.0.0.2")
+    assert caller.request("line2.subscribe", request)["success"]
+    first.stop()
+    run_scanner(allow=("127.0.0.1/32",), **more)
+    request = subscription(server, profile="heater", host="127.0.0.1")
+    assert caller.request("line2.subscribe", request)["success"]
+    wire.until(lambda: "a" in tags(), "it is carried out")
+    found = tags()["a"]
+    assert (found["writable"], found["description"]) == (True, "first")
 
 
 @pytest.mark.parametrize("part_bytes", [1, entries.MAX_PART_BYTES])

@@ -144,6 +144,13 @@ class NatsServer(Broker):
     def url(self) -> str:
         return f"nats://{self.host}:{self.port}"
 
+    def restarted(self, *options: str) -> tuple[str, ...]:
+        """Starts it again with other options; without any, JetStream is off. Returns the former."""
+        self.kill()
+        former, self._options = self._options, options
+        self.start()
+        return former
+
     def lose_store(self) -> None:
         """Removes everything that JetStream stored. The server must not run."""
         shutil.rmtree(self._folder / "store")

@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 from holdfast.net.nats.outbox import Outbox
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import (
+        Awaitable,
+        Callable,
+        Collection,
+        Iterable,
+        Iterator,
+        Mapping,
+        Sequence,
+    )
 
     from nats.aio.client import Client
     from nats.aio.msg import Msg
@@ -214,10 +222,12 @@ class Placement:
     def state_changed(self, device: str) -> None:
         """Notes that the state of a device has changed, or that the device is gone."""
 
-    async def settled(self, _subscription: SubscriptionKey, /) -> str | None:
+    async def settled(
+        self, _subscription: SubscriptionKey, _tags: Collection[str] = (), /
+    ) -> str | None:
         """Waits until a changed subscription is stored; not while JetStream fails.
 
-        Returns why it can't be stored, if so.
+        Returns why one of these tags can't be stored, if so.
         """
         return None
 

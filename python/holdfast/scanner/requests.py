@@ -128,7 +128,7 @@ class Requests:
                 )
             self._renew_former(subscription)
         # Outside the lock: storing can take seconds, and other requests need not wait for it.
-        unstored = await self._placement.settled(subscription.key)
+        unstored = await self._placement.settled(subscription.key, subscription.tags.keys())
         self._log.adjusted(subscription.subscriber, subscription.device, adjustments)
         self._log.byte_orders(subscription, adjustments, new)
         self._log.subscribed(subscription)
@@ -144,8 +144,10 @@ class Requests:
         if self._rules.dialect.replaces_subscription or not former:
             return
         if device is not None and subscription.subscriber in device.subscribers:
-            given = subscription.given_settings
-            former = with_later(former, device, subscription.subscriber, given)
+            more = device, subscription.subscriber, subscription.given_settings
+            # Each by itself: what is refused of one must not refuse another.
+            parts = [with_later([each], *more, self._rules.profiles) for each in former]
+            former = [joined(each) for each in parts if each]
         if former:
             self.former[subscription.key] = former
 
@@ -159,8 +161,11 @@ class Requests:
         async with self._devices.lock(request.device_id):
             await self._remove_stored(request)
         former = self.former.pop(owner, [])
-        if request.ids is not None and (left := without(former, set(request.ids))):
-            self.former[owner] = left
+        if request.ids is not None:
+            ids, profiles = set(request.ids), self._rules.profiles
+            left = [each for whole in former for each in without([whole], ids, profiles)]
+            if left:
+                self.former[owner] = left
         await self._placement.settled(owner)
         self._log.adjusted(request.subscriber_id, request.device_id, adjustments)
         self._log.unsubscribed(request)

@@ -6,7 +6,7 @@ import asyncio
 import logging
 import threading
 import time
-from itertools import chain, groupby
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
@@ -81,7 +81,7 @@ class Scanner:
             settings.limits, settings.defaults, settings.strict, dialect, settings.profiles
         )
         self._registry = Registry(settings.limits, settings.writes, dialect)
-        self._placement = _placement(settings, self._registry, start_thread)
+        self._placement = _placement(settings, self._registry, rules, start_thread)
         self._buckets = _buckets(settings)
         self.outbox = self._placement.outbox(lambda: self._publishers.repeat_values())
         self._publishers = Publishers(prefix, dialect, self.outbox, self._placement)
@@ -183,9 +183,7 @@ class Scanner:
                 removals.append(request)
             else:
                 added.append(request)
-        # What was refused of a subscription is not joined with what was carried out of it.
-        parts = (list(group) for _, group in groupby(added, key=SubscriptionKey.of))
-        wholes = [*map(joined, sorted(parts, key=is_last))]
+        wholes = sorted(added, key=lambda whole: is_last([whole]))
         outcomes = await asyncio.gather(*map(self._restore, wholes))
         refused = [whole for whole, ok in zip(wholes, outcomes, strict=True) if not ok]
         for whole in refused:
@@ -214,6 +212,7 @@ class Scanner:
     def stored_requests(self) -> Iterator[SubscriptionRequest]:
         """Yields requests that make the subscriptions, except those from entries of a bucket.
 
+        One for each subscription, and one for each that is refused and may be accepted later.
         Requests before them remove what is stored and out of date.
         """
         yield from self.former
@@ -226,7 +225,7 @@ class Scanner:
         yield from self._placement.removals(owner for owner, _ in known)
         for owner, device in known:
             assert owner.subscriber is not None
-            yield from map(restored, requests(device, owner.subscriber))
+            yield joined([*map(restored, requests(device, owner.subscriber))])
         # Last: a refused one must not displace one that is carried out.
         yield from chain.from_iterable(self._requests.former.values())
 
@@ -321,11 +320,13 @@ class Scanner:
         await self.outbox.flush()
 
 
-def _placement(settings: Settings, registry: Registry, start_thread: StartThread) -> Placement:
+def _placement(
+    settings: Settings, registry: Registry, rules: Rules, start_thread: StartThread
+) -> Placement:
     if settings.fleet is not None:
         return FleetPlacement(settings, settings.fleet, registry, start_thread)
     if settings.keep_subscriptions:
-        return StoredSubscriptions(settings.prefix, registry, DIALECTS[settings.dialect])
+        return StoredSubscriptions(settings.prefix, registry, rules)
     return Placement()
 
 

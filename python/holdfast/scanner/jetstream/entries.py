@@ -20,11 +20,14 @@ from holdfast.scanner.subscriptions.subscription import SETTINGS
 from holdfast.scanner.subscriptions.tag import CODE_OF_AREA
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from holdfast.scanner.messages.types import Marker
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.tags import TagList
+
+    Profiles = Mapping[str, TagList]
 
 MAX_PART_BYTES = 128 * 1024
 """The size in bytes of tags above which a further entry is made."""
@@ -85,13 +88,19 @@ def requests(
         "ttl": known.ttl,
         "profile": known.profile,
     }
+    tags = (_tag(device.tags[id], options, known.profile) for id, options in known.tags.items())
+    yield from _parts(head, tags, max_bytes)
+
+
+def _parts(
+    head: Mapping[str, object], tags: Iterable[TagRequest], max_bytes: int
+) -> Iterator[bytes]:
     before = _encode({key: value for key, value in head.items() if value is not None})[:-1]
     before, after = before + b',"tags":[', b"]}"
     room = min(MAX_PART_BYTES, max_bytes - len(before) - len(after))
     part: list[bytes] = []
     size = 0
-    for id, options in known.tags.items():
-        text = _tag(device.tags[id], options, known.profile)
+    for text in map(_encode, tags):
         if part and size + len(text) > room:
             yield before + b",".join(part) + after
             part, size = [], 0
@@ -99,6 +108,14 @@ def requests(
         size += len(text) + len(b",")
     if part:
         yield before + b",".join(part) + after
+
+
+def resized(found: Iterable[SubscribeRequest], max_bytes: int) -> Iterator[bytes]:
+    """Yields stored requests again, as parts of limited size like those of `requests`."""
+    for each in found:
+        head = msgspec.to_builtins(msgspec.structs.replace(each, tags=[]))
+        del head["tags"]
+        yield from _parts(head, each.tags, max_bytes)
 
 
 def restored(value: bytes) -> SubscribeRequest:
@@ -123,19 +140,58 @@ def _with_cut_descriptions(value: bytes) -> bytes:
     return _encode(found | {"tags": tags})
 
 
-def without(found: Iterable[SubscribeRequest], ids: Collection[str]) -> list[SubscribeRequest]:
-    """Returns the requests without the tags with these ids, if they have tags left."""
+def tag_ids(parts: Iterable[SubscribeRequest], profiles: Profiles) -> set[str]:
+    """Returns the ids of the tags of stored requests, and of those that their profile has now."""
+    ids: set[str] = set()
+    for each in parts:
+        ids |= {tag.id for tag in each.tags} | _names(each.profile, profiles)
+    return ids
+
+
+def without(
+    found: Iterable[SubscribeRequest], ids: Collection[str], profiles: Profiles
+) -> list[SubscribeRequest]:
+    """Returns the requests of a subscriber without these tags, if they have tags left."""
     parts = list(found)
-    profile = next((each.profile for each in parts if each.profile is not None), None)
-    if any(tag.profile == profile and tag.id in ids for each in parts for tag in each.tags):
+    profile = next(filter(None, (each.profile for each in parts)), None)
+    of_profile = {tag.id for each in parts for tag in each.tags if tag.profile == profile}
+    # Also one that the profile has gained, which is in no request yet.
+    if not (of_profile | _names(profile, profiles)).isdisjoint(ids):
         profile = None  # The subscriber has not all of its tags any more.
     left = (
-        msgspec.structs.replace(
-            each, tags=[tag for tag in each.tags if tag.id not in ids], profile=profile
-        )
+        msgspec.structs.replace(each, tags=[tag for tag in each.tags if tag.id not in ids])
         for each in parts
     )
-    return [each for each in left if each.tags]
+    return [with_profile(each, profile, profiles) for each in left if each.tags]
+
+
+def _names(profile: str | None, profiles: Profiles) -> set[str]:
+    """Returns the ids of the tags that a profile has now."""
+    return set() if profile is None else {tag.name for tag in profiles.get(profile, ())}
+
+
+def with_profile(
+    request: SubscribeRequest, profile: str | None, profiles: Profiles
+) -> SubscribeRequest:
+    """Returns a stored request with another profile, or without one.
+
+    The tags of its own profile keep what that one sets, which is not stored with them.
+    """
+    former = request.profile
+    tags = request.tags
+    if former is not None and former != profile and former in profiles:
+        tags = [
+            _with_options(tag, profiles[former]) if tag.profile == former else tag for tag in tags
+        ]
+    return msgspec.structs.replace(request, tags=tags, profile=profile)
+
+
+def _with_options(tag: TagRequest, profile: TagList) -> TagRequest:
+    if tag.id not in profile or tag.writable is not None or tag.description is not None:
+        return tag
+    options = TagOptions.of_profile(profile[tag.id])
+    text = None if options.description is None else options.description[:MAX_DESCRIPTION]
+    return msgspec.structs.replace(tag, writable=options.writable, description=text)
 
 
 def with_later(
@@ -143,6 +199,7 @@ def with_later(
     device: ScannedDevice,
     subscriber: str,
     given: Collection[str],
+    profiles: Profiles,
 ) -> list[SubscribeRequest]:
     """Returns stored requests together with the later ones of a known subscriber.
 
@@ -151,9 +208,10 @@ def with_later(
     """
     later = [restored(value) for value in requests(device, subscriber)]
     ids = {tag.id for each in later for tag in each.tags}
-    earlier = [[tag for tag in _ordered(each) if tag.id not in ids] for each in parts]
-    profiles = (each.profile for each in (later[0], *parts))
-    changes: dict[str, Any] = {"profile": next(filter(None, profiles), None)}
+    profile = next(filter(None, (each.profile for each in (later[0], *parts))), None)
+    own = [with_profile(each, profile, profiles) for each in parts]
+    earlier = [[tag for tag in _ordered(each) if tag.id not in ids] for each in own]
+    changes: dict[str, Any] = {"profile": profile}
     if len(device.subscribers) == 1:
         for key in SETTINGS:
             if key not in given and (value := getattr(parts[0], key)) is not None:
@@ -198,12 +256,12 @@ def _place(device: ScannedDevice) -> dict[str, object]:
     return {"host": target.host, "port": target.port, "transport": target.transport}
 
 
-def _tag(tag: Tag, options: TagOptions, profile: str | None) -> bytes:
-    """Returns a tag as JSON; without what a subscription to its whole `profile` sets."""
+def _tag(tag: Tag, options: TagOptions, profile: str | None) -> TagRequest:
+    """Returns a tag as a request; without what a subscription to its whole `profile` sets."""
     if tag.meaning is not None and tag.profile == profile:
         options = NO_OPTIONS if options == TagOptions.of_profile(tag.meaning) else options
     text = options.description
-    made = TagRequest(
+    return TagRequest(
         id=tag.id,
         address=tag.address,
         function_code=CODE_OF_AREA[tag.area],
@@ -217,7 +275,6 @@ def _tag(tag: Tag, options: TagOptions, profile: str | None) -> bytes:
         null=sorted(map(_marker, tag.null), key=str) or None,
         profile=tag.profile,
     )
-    return _encode(made)
 
 
 def _marker(marker: Marker) -> Marker:

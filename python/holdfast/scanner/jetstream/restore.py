@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -20,12 +21,16 @@ from holdfast.scanner.jetstream.entries import (
     number,
     numbered,
     requests,
+    resized,
     restored,
     status_key,
+    tag_ids,
     with_later,
+    with_profile,
     without,
 )
 from holdfast.scanner.jetstream.store import EntryStore
+from holdfast.scanner.messages.subject_parts import subject_id
 from holdfast.scanner.messages.types import Status
 from holdfast.scanner.placement import Placement
 from holdfast.scanner.subscriptions.key import SubscriptionKey
@@ -35,15 +40,18 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
 
-    from holdfast.scanner.dialects import Dialect
     from holdfast.scanner.messages.types import SubscribeRequest, UnsubscribeRequest
     from holdfast.scanner.placement import DeviceHost, SubscriptionHost
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
+    from holdfast.scanner.subscriptions.request_rules import Rules
     from holdfast.scanner.subscriptions.subscription import Subscription
 
-MAX_REMOVED_IDS = 10_000
-"""Limit of remembered ids of tags that a subscriber has removed: a device has no more."""
+MAX_CHANGED = 10_000
+"""Limit of subscriptions whose changes are remembered until the stored ones are read."""
+
+MAX_REMOVED_IDS = 100_000
+"""Limit of remembered ids of tags that they have removed, all together."""
 
 MAX_RESTORE_WAIT_S = 2.0
 """How long requests wait for stored subscriptions. After that, restoring continues."""
@@ -64,27 +72,33 @@ class Changes:
     given: set[str] = field(default_factory=set)
     """The `SETTINGS` that its requests contain."""
 
-    def remove(self, ids: Collection[str] | None) -> None:
-        """Removes tags; `None` for all."""
-        if ids is None:
-            self.replaces = True
-        elif len(self.removed) < MAX_REMOVED_IDS:
-            self.removed.update(ids)
+
+@dataclass(slots=True)
+class Pending:
+    """A stored subscription that is not carried out yet, with the later requests for it."""
+
+    parts: list[SubscribeRequest]
+    removed: set[str]
+    """The ids of tags that its subscriber has removed from what is stored."""
+    is_changed: bool
+    """Whether it is not as it is stored. Else its entries stay, whatever their size."""
+    is_logged: bool = False
+    """Whether its refusal is logged."""
 
 
 class StoredSubscriptions(Placement):
     """Stores the subscriptions and states of the registry, and restores them after a start."""
 
-    def __init__(self, prefix: str, registry: Registry, dialect: Dialect) -> None:
+    def __init__(self, prefix: str, registry: Registry, rules: Rules) -> None:
         self._prefix = prefix
         self._registry = registry
-        self._dialect = dialect
+        self._profiles = rules.profiles
+        self._dialect = rules.dialect
         self._changes: dict[SubscriptionKey, Changes] = {}
         """What subscribers change before the stored requests are read."""
-        self._pending: dict[SubscriptionKey, list[SubscribeRequest]] = {}
-        """Stored requests that are not carried out yet, and the later ones of their subscribers."""
-        self._logged: set[SubscriptionKey] = set()
-        """Pending subscriptions whose refusal is logged."""
+        self._removed_ids = 0
+        """How many ids `_changes` has."""
+        self._pending: dict[SubscriptionKey, Pending] = {}
         self._has_read = False
         self._found_pending = asyncio.Event()
         self._store = EntryStore(prefix, self._entries, self._on_read)
@@ -116,18 +130,18 @@ class StoredSubscriptions(Placement):
     ) -> None:
         """Stores a subscription that has changed, together with what is pending of it."""
         owner, given = subscription.key, subscription.given_settings
-        if not self._has_read:
-            changes = self._changes.setdefault(owner, Changes())
+        replaces = self._dialect.replaces_subscription
+        if not self._has_read and (given or replaces) and (changes := self._changes_of(owner)):
             changes.given |= given
-            changes.replaces |= self._dialect.replaces_subscription
+            changes.replaces |= replaces
         if is_stored:
             return
-        pending = [] if self._dialect.replaces_subscription else self._pending.get(owner, [])
-        if pending and (pending := with_later(pending, device, subscription.subscriber, given)):
-            self._pending[owner] = pending
-            self._store.touch(owner)
-        else:
+        pending = self._pending.get(owner)
+        if pending is None or replaces:
             self._touch(owner)
+        else:
+            more = device, subscription.subscriber, given, self._profiles
+            self._change(owner, pending, with_later(pending.parts, *more))
 
     def state_changed(self, device: str) -> None:
         """Stores the state of a device; removes it if the device is gone."""
@@ -135,41 +149,79 @@ class StoredSubscriptions(Placement):
 
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Removes tags of a subscription, also of a pending one."""
-        owner = SubscriptionKey.of(request)
-        ids = request.ids
-        if not self._has_read:
-            self._changes.setdefault(owner, Changes()).remove(ids)
-        left = [] if ids is None else without(self._pending.get(owner, []), set(ids))
-        self._touch(owner)
-        if left:
-            self._pending[owner] = left
+        owner, ids = SubscriptionKey.of(request), request.ids
+        if not self._has_read and (changes := self._changes_of(owner)):
+            if ids is None:
+                changes.replaces = True
+            else:
+                new = set(ids) - changes.removed
+                changes.removed.update(islice(new, MAX_REMOVED_IDS - self._removed_ids))
+                self._removed_ids = min(self._removed_ids + len(new), MAX_REMOVED_IDS)
+        pending = self._pending.get(owner)
+        if pending is None or ids is None:
+            self._touch(owner)
+        else:
+            removed = tag_ids(pending.parts, self._profiles).intersection(ids)
+            pending.removed |= removed
+            self._change(owner, pending, without(pending.parts, removed, self._profiles))
+
+    def _changes_of(self, owner: SubscriptionKey) -> Changes | None:
+        """Returns where to note changes; `None` if there are too many, which are forgotten then."""
+        if len(self._changes) < MAX_CHANGED:
+            return self._changes.setdefault(owner, Changes())
+        return self._changes.get(owner)
+
+    def _change(
+        self, owner: SubscriptionKey, pending: Pending, parts: list[SubscribeRequest]
+    ) -> None:
+        """Stores what a pending subscription has become. It is not pending without `parts`."""
+        if not parts:
+            self._touch(owner)
+            return
+        if parts != pending.parts:
+            pending.parts, pending.is_changed = parts, True
+        self._store.touch(owner)
 
     def removals(self, known: Iterable[SubscriptionKey], /) -> Iterator[UnsubscribeRequest]:
         """Yields what to remove from stored subscriptions, for the next scanner of this process."""
         if not self._has_read:
             for owner, changes in self._changes.items():
-                yield owner.removal(None if changes.replaces else list(changes.removed))
+                if changes.replaces or changes.removed:
+                    yield owner.removal(None if changes.replaces else list(changes.removed))
             return
         touched = {owner for owner in self._store.touched if owner.subscriber is not None}
         yield from super().removals((touched | {*known}) - self._pending.keys())
+        for owner in touched & self._pending.keys():
+            if removed := self._pending[owner].removed:  # The entries still have these tags.
+                yield owner.removal(list(removed))
 
-    async def settled(self, subscription: SubscriptionKey, /) -> str | None:
+    async def settled(
+        self, subscription: SubscriptionKey, tags: Collection[str] = (), /
+    ) -> str | None:
         """Waits until a changed subscription is stored; not while JetStream fails."""
-        return await self._store.settled(subscription)
+        if not await self._store.settled(subscription):
+            return None
+        limit = self._store.max_bytes
+        for value in (self._entries(subscription) or {}).values():
+            # Too large is only an entry with a single tag.
+            if len(value) > limit and restored(value).tags[0].id in tags:
+                return f"an entry takes {len(value)} bytes, the server takes {limit}"
+        return None
 
     def _touch(self, owner: SubscriptionKey) -> None:
         self._pending.pop(owner, None)
-        self._logged.discard(owner)
         self._store.touch(owner)
 
-    def _entries(self, owner: SubscriptionKey) -> Mapping[str, bytes]:
-        """Returns the entries of an owner: nothing, if it is gone."""
+    def _entries(self, owner: SubscriptionKey) -> Mapping[str, bytes] | None:
+        """Returns the entries of an owner: nothing, if it is gone; `None` if they stay."""
         if self._host.is_entry(owner):
             return {}
-        if owner in self._pending:
+        if (pending := self._pending.get(owner)) is not None:
+            if not pending.is_changed or self._is_displaced(owner):
+                return None
             assert owner.subscriber is not None
-            pending = map(msgspec.json.encode, self._pending[owner])
-            return numbered(self._prefix, owner.device, owner.subscriber, pending)
+            values = resized(pending.parts, self._store.max_bytes)
+            return numbered(self._prefix, owner.device, owner.subscriber, values)
         device = self._registry.devices.get(owner.device)
         if device is None:
             return {}
@@ -206,8 +258,10 @@ class StoredSubscriptions(Placement):
             if is_ours or owner in self._pending or not self._has_read:
                 owners[key] = owner
         if not self._has_read:
-            left = {owner: self._left(owner, parts) for owner, parts in found.items()}
-            self._pending = {owner: parts for owner, parts in left.items() if parts}
+            for owner, parts in found.items():
+                if left := self._left(owner, parts):
+                    removed = self._changes.get(owner, Changes()).removed
+                    self._pending[owner] = Pending(left, removed, left != parts)
             self._changes.clear()
             self._has_read = True
         for device in self._registry.devices.values():
@@ -224,16 +278,24 @@ class StoredSubscriptions(Placement):
         changes = self._changes.get(owner, Changes())
         left = [] if changes.replaces else parts
         if changes.removed:
-            left = without(left, changes.removed)
+            left = without(left, changes.removed, self._profiles)
         if left and self._is_known(owner):
             assert owner.subscriber is not None
             device = self._registry.devices[owner.device]
-            left = with_later(left, device, owner.subscriber, changes.given)
+            more = device, owner.subscriber, changes.given, self._profiles
+            left = with_later(left, *more)
         return left
 
     def _is_known(self, owner: SubscriptionKey) -> bool:
         device = self._registry.devices.get(owner.device)
         return device is not None and owner.subscriber in device.subscribers
+
+    def _is_displaced(self, owner: SubscriptionKey) -> bool:
+        """Whether a known subscription has the keys of this one: that of another device id."""
+        device = self._registry.named(subject_id(owner.device))
+        if device is None or device.id == owner.device:
+            return False
+        return owner.subscriber in device.subscribers
 
     async def _restore(self, ready: asyncio.Event) -> None:
         """Carries out pending requests, until it is cancelled."""
@@ -260,34 +322,45 @@ class StoredSubscriptions(Placement):
 
     async def _restore_device(self, owners: list[SubscriptionKey]) -> None:
         # Known subscribers first: they decide on the settings that all subscribers must share.
-        pending = [(is_last(self._pending.get(owner, [])), owner) for owner in owners]
-        for _, owner in sorted(pending, key=lambda each: (each[0], not self._is_known(each[1]))):
-            # Under the lock: a caller may change or end the subscription while this waits for it.
-            async with self._device_host.lock(owner.device):
-                if found := self._pending.get(owner):
-                    await self._restore_one(owner, found)
-
-    async def _restore_one(self, owner: SubscriptionKey, found: list[SubscribeRequest]) -> None:
-        try:
-            await self._host.restore(joined(found))
-        except Refused as refused:
-            if owner in self._logged:
-                return
-            self._logged.add(owner)
-            await self._restore_parts(owner, found)
+        pending = [(owner, self._pending[owner]) for owner in owners if owner in self._pending]
+        pending.sort(key=lambda each: (is_last(each[1].parts), not self._is_known(each[0])))
+        for owner, each in pending:
+            refused = await self._restore_one(owner)
+            if refused is None or each.is_logged:
+                continue
+            each.is_logged = True
+            await self._restore_parts(owner, each)
             log_lines.write(logging.WARNING, "not_restored", **owner.fields, reason=str(refused))
-            self._device_host.give_up(owner.device, str(refused))
-        else:
-            self._touch(owner)
-            tags = sum(len(request.tags) for request in found)
-            log_lines.write(logging.INFO, "restored", **owner.fields, tags=tags)
+            if owner in self._pending:
+                self._device_host.give_up(owner.device, str(refused))
 
-    async def _restore_parts(self, owner: SubscriptionKey, found: list[SubscribeRequest]) -> None:
+    async def _restore_one(self, owner: SubscriptionKey) -> Refused | None:
+        # Under the lock: a caller may change or end the subscription while this waits for it.
+        async with self._device_host.lock(owner.device):
+            if (pending := self._pending.get(owner)) is None:
+                return None
+            try:
+                await self._host.restore(joined(pending.parts))
+            except Refused as refused:
+                return refused
+            self._touch(owner)
+            tags = sum(len(request.tags) for request in pending.parts)
+            log_lines.write(logging.INFO, "restored", **owner.fields, tags=tags)
+            return None
+
+    async def _restore_parts(self, owner: SubscriptionKey, pending: Pending) -> None:
         """Carries out the parts of a refused subscription that are not refused alone.
 
         Before the restart, they may have been carried out by later requests.
         """
-        if len(found) > 1 and not self._is_known(owner):
-            for part in found:  # Without its profile, which would add the tags of other parts.
+        parts = pending.parts
+        if len(parts) < 2 or self._is_known(owner):
+            return
+        for part in parts:
+            # Each under the lock: requests must not wait for the lookups of all.
+            async with self._device_host.lock(owner.device):
+                if self._pending.get(owner) is not pending or pending.parts is not parts:
+                    return  # A caller has changed or ended it.
+                # Without its profile, which would add the tags of other parts.
                 with contextlib.suppress(Refused):
-                    await self._host.restore(msgspec.structs.replace(part, profile=None))
+                    await self._host.restore(with_profile(part, None, self._profiles))

@@ -29,7 +29,7 @@ from holdfast.scanner.jetstream.availability import (
 from holdfast.scanner.jetstream.key_watch import reading
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Set
+    from collections.abc import Callable, Collection, Mapping, Set
 
     from nats.aio.client import Client
     from nats.js import JetStreamContext
@@ -54,10 +54,12 @@ class EntryStore:
     def __init__(
         self,
         prefix: str,
-        entries: Callable[[SubscriptionKey], Mapping[str, bytes]],
+        entries: Callable[[SubscriptionKey], Mapping[str, bytes] | None],
         on_read: Callable[[list[tuple[str, bytes]]], Mapping[str, SubscriptionKey]],
     ) -> None:
         """`entries` returns what is to be stored for an owner: nothing, if it is gone.
+
+        `None` leaves what is stored as it is.
 
         `on_read` gets the stored entries after each connection. It returns the owners of those that
         are to be replaced or removed when their owner does not want them.
@@ -74,6 +76,8 @@ class EntryStore:
         """The hashes of the stored entries, by key."""
         self._too_large: dict[SubscriptionKey, str] = {}
         """Owners of which an entry is too large for the server, and why: it is not stored."""
+        self._oversized: set[str] = set()
+        """Keys of stored entries that the server would not take any more."""
         self.max_bytes = USUAL_MAX_PAYLOAD_BYTES
         """The size limit of an entry: that of messages."""
         self._owners: dict[str, SubscriptionKey] = {}
@@ -104,17 +108,17 @@ class EntryStore:
         self._touched.add(owner)
         self._has_work.set()
 
-    async def settled(self, owner: SubscriptionKey) -> str | None:
+    async def settled(self, owner: SubscriptionKey) -> bool:
         """Waits until the entries of a touched owner are stored; not while JetStream fails.
 
-        Returns why one of them can't be stored, if so.
+        Returns whether one of them is too large for the server.
         """
         if not self._availability.is_available or self._client is None:
-            return None
+            return False
         if owner in self._touched or owner in self._writing:
             stored = self._waiting.setdefault(owner, asyncio.Event())
             await stored.wait()
-        return self._too_large.get(owner)
+        return owner in self._too_large
 
     async def run(self) -> None:
         """Reads the entries after each connection, and writes changes, until it is cancelled."""
@@ -174,6 +178,7 @@ class EntryStore:
             entries += [(key, each.value) for key, each in found.items() if each is not None]
         owners = self._on_read(entries)
         self._stored, self._owners = {}, dict(owners)
+        self._oversized = {key for key, value in entries if len(value) > self.max_bytes}
         for key, value in entries:
             if key in owners:
                 self._stored.setdefault(owners[key], {})[key] = hash(value)
@@ -205,19 +210,29 @@ class EntryStore:
                 raise errors[0]
 
     async def _put(self, bucket: KeyValue, owner: SubscriptionKey) -> Set[str]:
-        """Writes the entries of an owner. Returns their keys."""
-        entries = self._without_too_large(owner)
+        """Writes the entries of an owner, except those too large. Returns the keys that stay."""
+        entries = self._entries(owner)
         stored = self._stored.setdefault(owner, {})
+        if entries is None:
+            return stored.keys()
+        too_large: dict[str, int] = {}
         for key, value in entries.items():
             if stored.get(key) == hash(value):  # A hash: values may take 128 KiB each.
+                continue
+            if len(value) > self.max_bytes:  # It must not delay the others.
+                too_large[key] = len(value)
                 continue
             former = self._owners.get(key, owner)
             if former != owner:  # It must not purge the key any more.
                 self._stored[former].pop(key, None)
             self._owners[key] = owner
             stored[key] = hash(value)  # After an error, everything is read again.
+            self._oversized.discard(key)
             await bucket.put(key, value)
-        return entries.keys()
+        self._note_too_large(owner, too_large.values())
+        # Only an entry from before the server's limit was lowered has what is too large now.
+        kept = self._oversized & stored.keys() if too_large else set()
+        return (entries.keys() - too_large.keys()) | kept
 
     async def _purge(
         self,
@@ -233,22 +248,20 @@ class EntryStore:
             # Unlike a deletion, a purge leaves no marker behind.
             await jetstream.purge_stream(STREAM, subject=KEY_SUBJECTS + key)
             del stored[key], self._owners[key]
+            self._oversized.discard(key)
         if not stored:
             del self._stored[owner]
 
-    def _without_too_large(self, owner: SubscriptionKey) -> Mapping[str, bytes]:
-        """Returns the entries of an owner that can be stored. The others must not delay any."""
-        entries = self._entries(owner)
-        sizes = [len(value) for value in entries.values() if len(value) > self.max_bytes]
+    def _note_too_large(self, owner: SubscriptionKey, sizes: Collection[int]) -> None:
+        """Notes, and logs once, that entries of an owner are too large; that none is, if so."""
         if not sizes:
             self._too_large.pop(owner, None)
-            return entries
+            return
         reason = f"an entry takes {max(sizes)} bytes, the server takes {self.max_bytes}"
         if self._too_large.get(owner) != reason:
             self._too_large[owner] = reason
             fields = {"bucket": BUCKET, **owner.fields}
             log_lines.write(logging.WARNING, "subscriptions_not_kept", **fields, reason=reason)
-        return {key: value for key, value in entries.items() if len(value) <= self.max_bytes}
 
     def _release(self) -> None:
         """Lets requests go on that wait for JetStream."""

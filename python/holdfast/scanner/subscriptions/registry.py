@@ -227,6 +227,11 @@ class Registry:
         names = {subject_id(device_id), *self._dialect.device_names(device_id)}
         return not names.isdisjoint(self._subjects)
 
+    def named(self, name: str) -> ScannedDevice | None:
+        """Returns the device with a name in subjects, if there is one."""
+        id = self._subjects.get(name)
+        return None if id is None else self.devices[id]
+
     def commanded(self, name: str) -> tuple[ScannedDevice, Tag]:
         """Returns the tag of a command's name: an id, or device and id. Raises `Refused`."""
         matches = {
