@@ -95,6 +95,22 @@ def test_a_device_that_does_not_answer_is_offline(plant: Plant) -> None:
         probe.until("plant/pump/temperature", "10.0")
 
 
+def test_a_device_that_a_reload_moves_is_offline_until_it_answers(plant: Plant) -> None:
+    plant.device().set(100)
+    probe = plant.probe("plant/#")
+    appliance = plant.run()
+    probe.until("plant/pump/temperature", "10.0")
+    probe.until("plant/holdfast/status/pump", "online")
+    other = plant.slow_device()
+    plant.devices["pump"].set(200)
+    other.hold()
+    appliance.reload(plant.config({}))
+    probe.until("plant/holdfast/status/pump", "offline")
+    other.go_on()
+    seen = probe.until("plant/holdfast/status/pump", "online")
+    assert texts(seen, "plant/pump/temperature") == ["20.0"], "no poll has failed"
+
+
 def test_what_another_output_after_a_reload_does_not_publish_is_removed(plant: Plant) -> None:
     plant.device()
     plant.device("fan")

@@ -313,6 +313,21 @@ def test_a_reload_is_a_new_birth(plant: Plant) -> None:
     assert set(watching.until("DBIRTH", "pump").metrics) == {"new"}
 
 
+def test_a_device_that_a_reload_moves_is_born_again_when_it_answers(plant: Plant) -> None:
+    plant.device().set(100)
+    watching = watch(plant)
+    appliance = plant.run(**SETTINGS)
+    assert watching.until("DBIRTH", "pump").metrics["temperature"].double_value == 10.0
+    other = plant.slow_device()
+    plant.devices["pump"].set(200)
+    other.hold()
+    appliance.reload(plant.config(SETTINGS))
+    watching.until("DDEATH", "pump")
+    other.go_on()
+    assert watching.until("DBIRTH", "pump").metrics["temperature"].double_value == 20.0
+    assert [said.kind for said in watching.said].count("DBIRTH") == 2
+
+
 def test_values_from_before_a_restart_are_published_for_a_device_that_is_gone(
     plant: Plant,
 ) -> None:

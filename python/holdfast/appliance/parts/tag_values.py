@@ -203,10 +203,19 @@ class TagValues:
             devices = {name: _info(config.devices[name]) for name in tagged}
             self.revision += bool(changed) or devices != self.devices
             self.devices = devices
+            moved = {
+                name
+                for name in before.keys() & tagged.keys()
+                if before[name].source != tagged[name].source
+            }
             began = {name: at for name, at in self.tagged_since.items() if name not in changed}
             self.tagged_since = dict.fromkeys(tagged, time.time()) | began
+            # Nobody knows yet whether the other machine answers.
+            self.answers += bool(moved)
             self._answering = {
-                name: answers for name, answers in self._answering.items() if name in tagged
+                name: answers and name not in moved
+                for name, answers in self._answering.items()
+                if name in tagged
             }
             self.standby &= tagged.keys()
             self._readers = {each.reported_as: each.reader for each in tagged.values()}
