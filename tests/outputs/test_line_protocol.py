@@ -78,6 +78,15 @@ def test_floats_have_their_digits_and_wide_integers_are_floats() -> None:
     assert lines(readings, "modbus", {}).decode() == expected
 
 
+def test_equal_offsets_with_other_digits_make_integers_or_floats() -> None:
+    """As it is written, -2.0**63 ends with 6000, which is less than all integers."""
+    offsets = {"n": -(2**63), "w": -(2.0**63)}
+    readings = [
+        reading(7, tag=tag(name, type="uint16", offset=each)) for name, each in offsets.items()
+    ]
+    assert lines(readings, "m", {}).decode() == f"m,device=pump n=7i,w=7.0 {AT}\n"
+
+
 NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0\n\r"), min_size=1).filter(
     lambda text: not text.endswith("\\")
 )

@@ -10,7 +10,7 @@ import pytest
 from holdfast import values
 from holdfast.tags import Tag, TagError, TagList
 from holdfast.tags.decoding import Places, Undecoded, decoder, value_of
-from holdfast.tags.scale import Form, RegisterScale
+from holdfast.tags.scale import Form, RegisterScale, linear_of
 from holdfast.tags.text import plain, text_of
 from holdfast.values import DoesNotFit
 
@@ -119,6 +119,13 @@ def test_floats_and_arrays_have_scales_too() -> None:
     assert value(large, [*values.encode(-1e308, "float64"), 10]) == -math.inf
     assert text_of(floating["power"], 21.5) == "21.5"
     assert text_of(by_name()["power"], 432.0) == "432"
+
+
+@pytest.mark.parametrize("offsets", [(2**63, 2.0**63), (2.0**63, 2**63)])
+def test_equal_offsets_with_other_digits_make_other_values(offsets: tuple[float, float]) -> None:
+    linear_of.cache_clear()
+    found = [value(by_name(offset=offset), [1, 0, 0]) for offset in offsets]
+    assert found == [2**63 + 1 if type(offset) is int else 2**63 + 193 for offset in offsets]
 
 
 def test_states_that_a_scale_can_not_have_do_not_refuse_it() -> None:

@@ -359,6 +359,14 @@ def test_tags_are_equal_and_found_by_their_settings() -> None:
     assert TagList([tag()]) == TagList([tag()]) != [tag()]
 
 
+def test_equal_numbers_with_other_digits_make_other_tags() -> None:
+    """As they are written, 2**63 ends with 808, and 2.0**63 with 6000."""
+    written = tag(offset=2**63), tag(offset=2.0**63)
+    assert written[0] != written[1]
+    assert TagList(written[:1]) != TagList(written[1:])
+    assert tag(scale=2) == tag(scale=2.0)
+
+
 def test_the_text_of_a_tag_makes_the_tag() -> None:
     made = TagList([tag(scale=0.1, offset=5), tag_of("sf")])
     text = repr(made)

@@ -56,7 +56,7 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
     ).encode()
 
 
-@lru_cache(1024)
+@lru_cache(1024, typed=True)
 def _is_wide(base: str, scale: float, offset: float) -> bool:
     """Whether some values of a type of integers do not fit the integers of the protocol."""
     linear = linear_of(scale, offset)

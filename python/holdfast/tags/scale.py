@@ -100,7 +100,8 @@ class RegisterScale:
         return linear_of(self.factor(content), offset)
 
 
-@lru_cache(1024)
+# 2**63 and 2.0**63 are equal, but as they are written, they have other digits.
+@lru_cache(1024, typed=True)
 def linear_of(scale: float, offset: float) -> Linear:
     """Scale and offset, cached."""
     return Linear(scale, offset)
@@ -120,6 +121,14 @@ class Linear:
         most = (abs(self._times) << 64) + abs(self._plus)
         self._whole = self._over == 1 and is_finite(most)
         self.is_identity = scale == 1 and offset == 0
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Linear):
+            return NotImplemented
+        return (self._scale, self._offset) == (other._scale, other._offset)
+
+    def __hash__(self) -> int:
+        return hash((self._scale, self._offset))
 
     def value(self, number: float | Fraction) -> int | float:
         """The value of a number, not NaN, in the registers; an integer if everything is one."""

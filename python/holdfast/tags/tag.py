@@ -107,8 +107,8 @@ class Tag(WritableTag):
 
     of_type: Type = field(init=False, repr=False)
     """The type, split into its parts."""
-    _linear: Linear = field(init=False, repr=False, compare=False)
-    """Of a scale in a register, only the offset."""
+    _linear: Linear = field(init=False, repr=False, hash=False)
+    """Of a scale in a register, only the offset. Equal numbers may have other digits here."""
 
     def _check_number(self) -> None:
         for key in _NUMBERS:
