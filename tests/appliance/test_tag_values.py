@@ -415,6 +415,51 @@ def test_a_reload_keeps_the_values_of_tags_that_stay(tmp_path: Path) -> None:
     assert found.latest() == []
 
 
+@pytest.mark.parametrize("is_tag_changed", [False, True])
+def test_a_reload_keeps_the_values_of_the_same_machine_and_tags(
+    tmp_path: Path, is_tag_changed: bool
+) -> None:
+    """Also if the URL has another spelling, or a tag another description."""
+    made = settings(502)
+    power_tag = METER["tags"]["power"]
+    found = TagValues(cast("Any", Polls()))
+    before = adopt(found, load(saved(tmp_path, made)))
+    found._handle(deque([(before["m"], 0.0, registers(10))]))
+    state = found.answers, found.tagged_since, len(found.latest())
+    revision = found.revision
+    if is_tag_changed:
+        changed = {"power": power_tag | {"description": "of all phases", "writable": True}}
+        made["profiles"] = {"meter": {"tags": METER["tags"] | changed}}
+    else:
+        made["devices"]["m"]["url"] += "/"
+    config = load(saved(tmp_path, made))
+    tagged = found.tagged(config, config.devices)
+    assert found.adopt(config, tagged) == set(), "nothing has to be read at once"
+    assert {"m": tagged["m"].reported_as} == before
+    assert (found.answers, found.tagged_since, len(found.latest())) == state
+    assert found.revision == revision + is_tag_changed
+    assert all(found.find("m", each.name) is each.tag for each in found.latest())
+    found._handle(deque([(before["m"], 0.0, registers(20))]))
+    assert power(found) == [2.0], "a poll under way counts"
+
+
+@pytest.mark.parametrize(
+    "changed", [{"scale": 1}, {"offset": 1}, {"type": "int16"}, {"address": 1}, {"unit": "kW"}]
+)
+def test_a_reload_forgets_the_value_of_a_tag_with_another_meaning(
+    tmp_path: Path, changed: dict[str, Any]
+) -> None:
+    made = settings(502)
+    found = TagValues(cast("Any", Polls()))
+    before = adopt(found, load(saved(tmp_path, made)))["m"]
+    found._handle(deque([(before, 0.0, registers(10))]))
+    tags = METER["tags"] | {"power": METER["tags"]["power"] | changed}
+    made["profiles"] = {"meter": {"tags": tags}}
+    config = load(saved(tmp_path, made))
+    assert found.adopt(config, found.tagged(config, config.devices)) == {"m"}
+    assert {each.name for each in found.latest()} == {"on", "label", "phases"}
+
+
 @pytest.mark.parametrize("is_moved", [False, True])
 def test_after_a_reload_a_device_is_read_at_once(
     tmp_path: Path, device: int, serve: Serve, is_moved: bool

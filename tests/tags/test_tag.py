@@ -367,6 +367,10 @@ def test_equal_numbers_with_other_digits_make_other_tags() -> None:
     assert tag(scale=2) == tag(scale=2.0)
 
 
+def test_tags_that_have_nan_as_marker_are_equal() -> None:
+    assert tag(type="float32", null={"nan"}) == tag(type="float32", null={float("nan")})
+
+
 def test_the_text_of_a_tag_makes_the_tag() -> None:
     made = TagList([tag(scale=0.1, offset=5), tag_of("sf")])
     text = repr(made)

@@ -96,7 +96,8 @@ class Tag(WritableTag):
             raise TagError("null", f"null is {shown(self.null)}, allowed: a set, as in {{65535}}")
         try:
             null = (as_decoded(marker, self.of_type, self.encoding) for marker in self.null)
-            self._put("null", frozenset(null))
+            # One NaN for all: a set with another one is not equal.
+            self._put("null", frozenset(math.nan if each != each else each for each in null))
         except ValueError as error:
             raise TagError("null", str(error)) from None
         self._check_number()
@@ -170,6 +171,15 @@ class Tag(WritableTag):
         source = self.scale.source if isinstance(self.scale, RegisterScale) else None
         assert source is None or isinstance(source, Tag)
         return source
+
+    @property
+    def place_and_meaning(self) -> tuple[object, ...]:
+        """Where the value is, and what it means: as long as it stays, so do values."""
+        scale, source = self.scale, self.source
+        form = scale.form if isinstance(scale, RegisterScale) else None
+        place = (self.area, self.address, self.type, self.order, self.encoding)
+        of = None if source is None else source.place_and_meaning
+        return (*place, form, of, self._linear, self.unit, self.states, self.null)
 
     @property
     def unwritable(self) -> str | None:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
+from holdfast.appliance.parts.native_links import destination
 from holdfast.client.url import NetworkTarget
 from holdfast.config.models.devices import DeviceIdentityConfig
 from holdfast.events import log_lines
@@ -27,7 +28,7 @@ from holdfast.polling.readings import Reader
 from holdfast.runtime.heartbeat import Heartbeat
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 
     from holdfast._core import PollReceiver
     from holdfast.config import Config
@@ -79,21 +80,36 @@ def _info(device: DeviceConfig) -> DeviceInfo:
 class TaggedDevice(NamedTuple):
     """A device with tags, which a reload replaces if they or their source change."""
 
-    source: tuple[str, int]
-    """Its URL and its unit id: with others, it is another machine."""
+    source: object
+    """Its connection and its unit id: with others, it is another machine."""
     reader: Reader
     reported_as: str
-    """Its name in polls, which no other `TaggedDevice` has: a poll may come late."""
+    """Its name in polls, which is another one after a change of what is read: polls may be late."""
+
+    @property
+    def contents(self) -> tuple[object, dict[str, object]]:
+        """What is read: the source, and the place and meaning of each tag."""
+        tags = self.reader.named.items()
+        return self.source, {name: tag.place_and_meaning for name, tag in tags}
+
+
+def _identities(tagged: Mapping[str, TaggedDevice]) -> set[tuple[str, str]]:
+    return {(name, device.reported_as) for name, device in tagged.items()}
 
 
 def _kept(poll: DevicePoll, before: TaggedDevice, now: TaggedDevice | None) -> list[Reading]:
-    """What a reload leaves of a poll: the readings of the same machine whose tags are as before."""
+    """What a reload leaves of a poll: the readings of the same machine that mean the same."""
     if now is before:
         return poll.readings
     if now is None or now.source != before.source:
         return []
     tags = now.reader.named
-    return [reading for reading in poll.readings if tags.get(reading.name) == reading.tag]
+    return [
+        reading._replace(tag=tag)
+        for reading in poll.readings
+        if (tag := tags.get(reading.name)) is not None
+        and tag.place_and_meaning == reading.tag.place_and_meaning
+    ]
 
 
 @dataclass
@@ -181,12 +197,14 @@ class TagValues:
         for name, device in config.devices.items():
             if not device.is_polled or not len(tags := config.tags(name)):
                 continue
-            source, known = (device.url, device.unit), self._tagged.get(name)
-            is_same = known is not None and (
-                name not in changed or (known.source, known.reader.tags) == (source, tuple(tags))
-            )
-            if known is None or not is_same:
-                known = TaggedDevice(source, Reader(name, tags), f"{name}#{next(self._numbers)}")
+            known = self._tagged.get(name)
+            if known is None or name in changed:
+                source, reader = destination(config, name), Reader(name, tags)
+                now = TaggedDevice(source, reader, f"{name}#{next(self._numbers)}")
+                if known is None or known.contents != now.contents:
+                    known = now
+                elif known.reader.tags != reader.tags:  # Other limits, or another description.
+                    known = known._replace(reader=reader)
             found[name] = known
         return found
 
@@ -197,11 +215,9 @@ class TagValues:
         """
         with self._lock:
             before, self._tagged = self._tagged, tagged
-            changed = {
-                name for name in {*before, *tagged} if before.get(name) is not tagged.get(name)
-            }
+            changed = {name for name, _ in _identities(before) ^ _identities(tagged)}
             devices = {name: _info(config.devices[name]) for name in tagged}
-            self.revision += bool(changed) or devices != self.devices
+            self.revision += before != tagged or devices != self.devices
             self.devices = devices
             moved = {
                 name
