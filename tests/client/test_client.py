@@ -21,6 +21,7 @@ import time
 import warnings
 from array import array
 from collections import UserList, deque
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -62,7 +63,7 @@ from support.paths import DOCS
 from support.running import endpoint
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Iterator, Sequence
+    from collections.abc import Awaitable, Callable, Iterator
 
     from holdfast.types import Area, Integers
     from support.fake_device import Answer, Behaviour
@@ -382,6 +383,21 @@ def test_a_large_write_takes_several_requests_if_that_is_allowed(
     assert counted == requests
 
 
+class Unsliced(Sequence[int]):
+    """A sequence that refuses slices with an error of its own."""
+
+    def __init__(self, words: range, error: Exception) -> None:
+        self.words, self.error = words, error
+
+    def __len__(self) -> int:
+        return len(self.words)
+
+    def __getitem__(self, at: Any) -> Any:
+        if isinstance(at, slice):
+            raise self.error
+        return self.words[at]
+
+
 @pytest.mark.parametrize(
     "of",
     [
@@ -389,10 +405,18 @@ def test_a_large_write_takes_several_requests_if_that_is_allowed(
         tuple,
         deque,
         UserList,
+        lambda words: Unsliced(words, TypeError()),
+        lambda words: Unsliced(words, ValueError()),
+        lambda words: Unsliced(words, IndexError()),
+        lambda words: Unsliced(words, AttributeError()),
         lambda words: array("H", words),
         lambda words: dict.fromkeys(words).keys(),
     ],
-    ids=["list", "tuple", "deque", "user_list", "array", "keys"],
+    ids=[
+        *("list", "tuple", "deque", "user_list"),
+        *("type_error", "value_error", "index_error", "attribute_error"),
+        *("array", "keys"),
+    ],
 )
 def test_a_write_of_any_sequence_may_take_several_requests(
     of: Callable[[range], Integers], large: Large, dial: Dial

@@ -196,14 +196,16 @@ def write_range(
         return
     if not split:
         raise TooManyValues(len(items), limit)
+    with contextlib.suppress(ValueError):  # There are too many items for one request.
+        make(address, items)  # Refuses what is not a sequence of integers, such as a mapping.
+    items = list(items)  # Not every sequence has slices.
     size = _whole_elements(limit, element)
     starts = _starts(address, len(items), size)
-    items = _with_slices(make, address, items)
     try:
         requests = [
             make(start, items[start - address : start - address + size]) for start in starts
         ]
-    except (TypeError, ValueError):
+    except ValueError:
         make(address, items)  # Its error has the index in all items.
         raise
     for start, request in zip(starts, requests, strict=True):
@@ -214,22 +216,6 @@ def write_range(
                 items_of = "coils" if area == "coils" else "registers"
                 error.note_written(start - address, f"{len(items)} {items_of}")
             raise
-
-
-def _with_slices(
-    make: Callable[[int, Integers], Request], address: int, items: Integers
-) -> Integers:
-    """The items, or a list of them if they have no slices, such as those of a deque.
-
-    Raises `TypeError` for what `make` refuses whatever its items are, such as a mapping.
-    """
-    try:
-        items[:0]
-    except (KeyError, TypeError):  # A mapping looks for a key.
-        with contextlib.suppress(ValueError):  # There are too many items for one request.
-            make(address, items)
-        return list(items)
-    return items
 
 
 def read_typed(area: Area, address: int, kind: str, order: str, encoding: str | None) -> Steps[Any]:
