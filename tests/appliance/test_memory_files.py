@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import resource
+import shutil
 import signal
 import socket
 import urllib.error
@@ -411,6 +412,32 @@ def test_another_file_in_the_place_of_its_own_is_not_changed(plant: Plant) -> No
     assert code == 1
     assert " error memory_file_lost " in log
     assert file.read_bytes() == b"other"
+
+
+@pytest.mark.parametrize(("removed", "lost"), [(False, [0, 0]), (True, [2, 1])])
+def test_writes_in_a_file_that_was_moved_with_its_folder_are_not_lost(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, removed: bool, lost: list[int]
+) -> None:
+    kept, moved, copy = (tmp_path / name for name in ("kept", "moved", "copy"))
+    kept.mkdir()
+    settings = config(tmp_path, plant=keeping(file="kept/plant.redb"))
+    # The second start writes nothing.
+    for values, expected in zip([[7, 8], []], lost, strict=True):
+        caplog.clear()
+        with Appliance(settings) as appliance:
+            for value in values:
+                appliance.memories["plant"].write("holding_registers", 3, [value])
+            kept.rename(moved)
+            if removed:
+                shutil.copytree(moved, copy)
+                shutil.rmtree(moved)
+        assert appliance.lost_writes == expected
+        events = {each.message: vars(each)["fields"] for each in caplog.records}
+        assert "its folder is gone" in str(events["memory_file_failing"]["error"])
+        assert events.get("memory_file_lost", {"writes": 0})["writes"] == expected
+        (copy if removed else moved).rename(kept)
+        with Appliance(settings) as again:
+            assert again.memories["plant"].read("holding_registers", 3, 1) == [8]
 
 
 class FakeFile:

@@ -458,8 +458,8 @@ fn a_file_system_that_is_gone_refuses_steps_until_it_is_back() {
     assert_eq!(after_a_kill(&path), (1, 3));
     assert_eq!((file.status().failing, file.status().recreated), (None, 0));
     lead_to(empty);
-    assert!(matches!(file.stop(), Err(FileError::FolderGone)));
-    assert_eq!(file.status().pending, 2, "nothing of it is found");
+    assert!(matches!(file.stop(), Err(FileError::FolderGone { was_removed: false })));
+    assert_eq!(file.status().pending, 0, "it is all on the other file system");
     assert_eq!(std::fs::read_dir(empty).unwrap().count(), 0);
     std::fs::remove_dir_all(&mounted).unwrap();
 }
@@ -477,4 +477,59 @@ fn a_folder_that_is_gone_refuses_steps_until_it_is_back() {
     set(&one, 1, 3).unwrap();
     assert_eq!(after_a_kill(&path), (1, 3));
     assert_eq!(file.status().failing, None);
+}
+
+/// How many writes are missing after a stop, if this is done to the folder of the file, and then one more write
+/// comes. Before it, there were two writes, or none but one of an earlier start.
+#[cfg(unix)]
+fn not_found(sync: Duration, is_loaded: bool, spoil: impl Fn(&Path, &Path)) -> u64 {
+    let options = || Options { retry: Duration::from_secs(3600), ..Options::new(sync) };
+    let (path, mut one, mut file) = kept("spoiled", options());
+    if is_loaded {
+        file.stop().unwrap();
+        one = memory(layout(0, 1000), None);
+        file = keep(&Arc::new(FileOnDisk::new(&path)), &[("one", &one)], options()).unwrap();
+        assert_eq!(get(&one, 0), 1);
+    } else {
+        set(&one, 1, 2).unwrap();
+        until("it is stored", || file.status().pending == 0);
+    }
+    let moved = path.parent().unwrap().with_extension("moved");
+    let _ = std::fs::remove_dir_all(&moved);
+    spoil(path.parent().unwrap(), &moved);
+    let _ = set(&one, 2, 3);
+    file.stop().unwrap_err();
+    file.status().pending
+}
+
+#[cfg(unix)]
+#[test]
+fn what_a_file_has_that_was_moved_with_its_folder_is_not_missing() {
+    let moving = |folder: &Path, moved: &Path| std::fs::rename(folder, moved).unwrap();
+    for is_loaded in [false, true] {
+        assert_eq!(not_found(Duration::ZERO, is_loaded, moving), 0, "the last write was refused");
+        let unstored = not_found(Duration::from_millis(50), is_loaded, moving);
+        assert_eq!(unstored, 1, "the last write was confirmed");
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn what_was_stored_in_a_file_that_is_away_is_missing() {
+    // Moved first, so that nothing writes the file anew while its folder is removed.
+    let remove = |folder: &Path, moved: &Path| {
+        std::fs::rename(folder, moved).unwrap();
+        std::fs::remove_dir_all(moved).unwrap();
+    };
+    let replace = |folder: &Path, moved: &Path| {
+        std::fs::write(moved, "other").unwrap();
+        std::fs::rename(moved, folder.join("memories.redb")).unwrap();
+    };
+    let spoiling: [fn(&Path, &Path); 2] = [remove, replace];
+    for spoil in spoiling {
+        assert_eq!(not_found(Duration::ZERO, false, spoil), 2);
+        assert_eq!(not_found(Duration::from_secs(1), false, spoil), 3);
+        assert_eq!(not_found(Duration::ZERO, true, spoil), 1, "what was loaded is away too");
+        assert_eq!(not_found(Duration::from_secs(1), true, spoil), 1);
+    }
 }

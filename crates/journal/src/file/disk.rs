@@ -196,7 +196,7 @@ impl Disk for FileOnDisk {
             // A mount point that is empty has no file either, but that is back with its file system.
             return match fs::metadata(self.folder()) {
                 Ok(found) if is_on_same_file_system(folder, &found) => Ok(false),
-                _ => Err(FileError::FolderGone),
+                _ => Err(FileError::FolderGone { was_removed: was_removed(file) }),
             };
         };
         match file.metadata() {
@@ -253,13 +253,26 @@ fn is_on_same_file_system(one: &fs::Metadata, other: &fs::Metadata) -> bool {
     one.dev() == other.dev()
 }
 
+/// Whether no folder has the file any more. A file that can't be asked may still be somewhere.
+#[cfg(unix)]
+fn was_removed(file: &fs::File) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    file.metadata().is_ok_and(|found| found.nlink() == 0)
+}
+
 /// The standard library does not show the number of a file on Windows.
 #[cfg(not(unix))]
 fn is_same(_: &fs::Metadata, _: &fs::Metadata) -> bool {
     true
 }
 
-/// Nor that of a file system.
+/// Nor how many names a file has.
+#[cfg(not(unix))]
+fn was_removed(_: &fs::File) -> bool {
+    false
+}
+
+/// Nor the number of a file system.
 #[cfg(not(unix))]
 fn is_on_same_file_system(_: &fs::Metadata, _: &fs::Metadata) -> bool {
     true

@@ -25,11 +25,12 @@ pub enum FileError {
          a start would load the other file"
     )]
     Replaced,
-    /// The file is gone with its folder, or with the file system that was mounted there.
+    /// The file is gone with its folder, or with the file system that was mounted there. Unless it is known
+    /// that the file was removed, it may still be there, with all that was stored.
     #[error(
         "its folder is gone, or on another file system. Put the folder back, or mount its file system again"
     )]
-    FolderGone,
+    FolderGone { was_removed: bool },
     #[error("{0}")]
     Io(#[from] io::Error),
     /// The file does not fit the log of its memories.

@@ -70,6 +70,8 @@ pub struct MemoryFile {
     note: Option<Vec<u8>>,
     queue: Arc<Queue>,
     status: Arc<Mutex<Status>>,
+    /// How many writes there were at the start. To load contents counts as one.
+    first_writes: AtomicU64,
     /// How many writes to the memories are in the file, with a `sync` above 0.
     stored_writes: Arc<AtomicU64>,
     /// The process that opened the file. A forked child must not touch it.
@@ -169,6 +171,7 @@ impl MemoryFile {
             note,
             queue,
             status,
+            first_writes: AtomicU64::new(0),
             stored_writes,
             process,
             state,
@@ -203,7 +206,9 @@ impl MemoryFile {
         let mut ids = Vec::new();
         // No step may come between the contents that are stored and the first that waits.
         self.queue.begin(|| {
-            self.stored_writes.store(writes(&memories), Ordering::Relaxed);
+            let written = writes(&memories);
+            self.first_writes.store(written, Ordering::Relaxed);
+            self.stored_writes.store(written, Ordering::Relaxed);
             let (contents, note) = match &log {
                 None => (Memory::contents(&memories), None),
                 Some(log) => {
@@ -269,7 +274,10 @@ impl MemoryFile {
         let mut status = lock(&self.status).clone();
         let written: u64 = self.members.iter().map(|member| member.memory.writes()).sum();
         status.pending = if status.is_away {
-            written
+            // The contents of earlier starts are away too. Nobody knows how many writes they were, but their
+            // loss must show.
+            let since_start = written.saturating_sub(self.first_writes.load(Ordering::Relaxed));
+            since_start.max(u64::from(!self.loaded.is_empty()))
         } else if self.options.stores_before_reply() {
             self.queue.waiting() as u64
         } else {

@@ -25,6 +25,7 @@ pub struct Status {
     pub recreated: u64,
     /// Since when the disk has not answered.
     pub(super) busy_since: Option<Instant>,
-    /// Nothing of the contents is in the file: it is gone, or something else is in its place.
+    /// Nothing of the contents is where a start looks for them: the file was removed, or renamed, or something
+    /// else is in its place. A file that was moved with its folder, or is not mounted, still has them.
     pub(super) is_away: bool,
 }

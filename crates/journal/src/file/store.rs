@@ -83,8 +83,11 @@ impl Store {
         self.note(|status| status.busy_since = Some(began));
         let stored = self.try_store(changes);
         // After an I/O error, the file may be in its place.
-        let is_away =
-            stored.is_err() && !matches!(self.disk.is_in_place(), Ok(true) | Err(FileError::Io(_)));
+        let is_away = stored.is_err()
+            && !matches!(
+                self.disk.is_in_place(),
+                Ok(true) | Err(FileError::Io(_) | FileError::FolderGone { was_removed: false })
+            );
         let bytes = self.bytes();
         self.note(|status| {
             (status.busy_since, status.is_away) = (None, is_away);
