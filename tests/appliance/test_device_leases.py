@@ -226,7 +226,8 @@ def test_values_of_a_node_that_was_cut_off_are_refused_when_they_arrive_late(
             # What the first node has sent before comes before this.
             wire.until(lambda: ask(one, "0600000001") == "0600000001", "it is connected again")
             wire.until(lambda: ask(two, "0300000001") == "03020001", "the other node has followed")
-            assert [ask(each, "03000b0001") for each in (one, two)] == [newest, newest]
+            # The device counts its polls. The first node may poll it again: its term is brief.
+            assert min(ask(each, "03000b0001") for each in (one, two)) >= newest
 
 
 def test_a_device_of_a_kept_memory_too_is_written_into_the_log_by_the_next_holder(
