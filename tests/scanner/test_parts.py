@@ -23,12 +23,15 @@ from holdfast.scanner.commands import Commands
 from holdfast.scanner.dialects import TENTACLE
 from holdfast.scanner.errors import Moved
 from holdfast.scanner.jetstream.heartbeat import HeartbeatKey
+from holdfast.scanner.messages.decoding import Adjustments
 from holdfast.scanner.messages.types import (
     Answer,
     BrowseRequest,
     EntryReport,
     HeartbeatMetadata,
     ServiceReport,
+    SubscribeRequest,
+    TagRequest,
 )
 from holdfast.scanner.placement import Placement
 from holdfast.scanner.publish.publisher import Publisher
@@ -45,7 +48,8 @@ from holdfast.scanner.subscriptions.groups import Group, grouped
 from holdfast.scanner.subscriptions.health import Health
 from holdfast.scanner.subscriptions.plan import Plan
 from holdfast.scanner.subscriptions.registry import Registry
-from holdfast.scanner.subscriptions.request_rules import ScannerLimits
+from holdfast.scanner.subscriptions.request_rules import Rules, ScannerLimits
+from holdfast.scanner.subscriptions.subscription import subscription_of
 from holdfast.scanner.subscriptions.tag import Tag
 from holdfast.tags.decoding import Places, decoder
 from support.nats_bus import logged
@@ -722,3 +726,18 @@ def test_requests_do_not_wait_for_ever_until_the_scanner_is_ready(
 
     [answer] = asyncio.run(work())
     assert json.loads(answer) == {"success": False, "error": expected}
+
+
+def test_a_tag_whose_null_is_nan_is_the_same_in_every_request() -> None:
+    registry = Registry(ScannerLimits())
+    tag = TagRequest("t", 0, "holding", "float32", null=["nan"])
+    changes = []
+    for subscriber in ("a", "b", "a"):
+        request = SubscribeRequest("d", subscriber, [tag], host="127.0.0.1")
+        wanted = subscription_of(request, Rules(), Adjustments())
+        changes.append(registry.subscribe(wanted, wanted.source.target))
+    assert [(change.polling, {*change.new}) for change in changes] == [
+        (True, {"t"}),
+        (False, {"t"}),
+        (False, set()),
+    ]

@@ -96,8 +96,7 @@ class Tag(WritableTag):
             raise TagError("null", f"null is {shown(self.null)}, allowed: a set, as in {{65535}}")
         try:
             null = (as_decoded(marker, self.of_type, self.encoding) for marker in self.null)
-            # One NaN for all: a set with another one is not equal.
-            self._put("null", frozenset(math.nan if each != each else each for each in null))
+            self._put("null", frozenset(null))
         except ValueError as error:
             raise TagError("null", str(error)) from None
         self._check_number()
@@ -264,14 +263,17 @@ def as_decoded(marker: Marker, type: Type, encoding: str | None) -> Marker:
     """
     if type.base == "bytes":
         raise ValueError(f"not supported for {type.name}")
+    made: Marker
     if marker in ("nan", "inf", "-inf") and type.is_float:
-        return float(marker)
-    try:
-        registers = encode(marker, type.element, encoding=encoding)
-        made: Marker = decode(registers, type.element, encoding=encoding)
-    except (ConversionError, TypeError) as error:
-        raise ValueError(str(error)) from None
-    return made
+        made = float(marker)
+    else:
+        try:
+            registers = encode(marker, type.element, encoding=encoding)
+            made = decode(registers, type.element, encoding=encoding)
+        except (ConversionError, TypeError) as error:
+            raise ValueError(str(error)) from None
+    # One NaN for all: a set with another one is not equal.
+    return math.nan if made != made else made
 
 
 class TagList:
