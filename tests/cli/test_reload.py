@@ -9,13 +9,17 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from holdfast.appliance import control
 from holdfast.appliance.control import ask
+from holdfast.cli.services import run
 from support import wire
 from support.cli import RunCommand, answer, done, failure, invoke
+from support.commands import Command
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -216,9 +220,9 @@ def test_without_an_appliance_both_say_so(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("running")
 def test_only_the_user_of_the_appliance_can_open_the_control_socket() -> None:
-    (control,) = Path(os.environ["XDG_RUNTIME_DIR"]).glob("holdfast/*.sock")
-    assert stat.S_IMODE(control.stat().st_mode) == 0o600
-    assert stat.S_IMODE(control.parent.stat().st_mode) == 0o700
+    (found,) = Path(os.environ["XDG_RUNTIME_DIR"]).glob("holdfast/*.sock")
+    assert stat.S_IMODE(found.stat().st_mode) == 0o600
+    assert stat.S_IMODE(found.parent.stat().st_mode) == 0o700
 
 
 def test_a_wrong_request_at_the_control_socket_is_answered_with_an_error(running: Running) -> None:
@@ -234,3 +238,44 @@ def test_the_socket_of_a_killed_appliance_is_taken_over(running: Running) -> Non
     running.command.wait_until_it_serves()
     assert done("sessions", str(running.file)) == ["no open connections"]
     assert "control_unavailable" not in running.end()
+
+
+def test_a_second_start_of_the_same_file_says_that_it_runs(running: Running) -> None:
+    second = Command("run", str(running.file))
+    problem = f"holdfast: {running.file}: another appliance of this user runs it on this machine\n"
+    try:
+        assert second.wait(wire.DEADLINE) == 1
+    finally:
+        second.kill()
+    assert second.communicate() == ("", problem)
+    assert done("sessions", str(running.file)) == ["no open connections"]
+
+
+def test_of_two_that_start_at_the_same_time_one_ends(
+    running: Running, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """When the other one looked, this one did not have its socket yet."""
+    unused: Any = SimpleNamespace(ask=None)
+    with pytest.raises(SystemExit, match="1"):
+        run._control(unused, unused, running.file)
+    assert "another appliance of this user runs it" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs symbolic links")
+def test_another_path_to_the_same_file_can_be_started(running: Running) -> None:
+    other = running.file.with_name("other.yaml")
+    other.symlink_to(running.file)
+    second = RunCommand(other)
+    second.wait_until_it_serves()
+    assert second.end(signal.SIGTERM)[0] == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="other systems have no such file")
+def test_a_stream_is_another_configuration_each_time(running: Running) -> None:
+    stream = Path("/dev/stdin")
+    first = control.Control(stream, {})
+    try:
+        assert control.is_run(running.file)
+        assert not control.is_run(stream)
+    finally:
+        first.close()

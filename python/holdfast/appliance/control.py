@@ -122,6 +122,19 @@ class Control:
             return {"error": f"invalid request: {error}"}
 
 
+def is_run(file: Path) -> bool:
+    """Whether a process that this user has started with this path still runs.
+
+    Another path to the same file does not count: with relative paths in it, its appliance is
+    another one. Nor does a stream, such as /dev/stdin, which has another content for each process.
+    """
+    if file.absolute().is_relative_to("/dev") or file.absolute().is_relative_to("/proc"):
+        return False
+    with contextlib.suppress(OSError):
+        return _is_alive(_own_addresses(file)[0])
+    return False
+
+
 def ask(
     file: Path,
     do: str,

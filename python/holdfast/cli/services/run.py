@@ -8,14 +8,14 @@ import shutil
 import sys
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
 from holdfast._core import UnusableMemoryFile
 from holdfast.adapters.plugins import UnknownAdapter
 from holdfast.appliance import Appliance
-from holdfast.appliance.control import Control
+from holdfast.appliance.control import Control, is_run
 from holdfast.appliance.parts.shared_logs import LogNotJoined
 from holdfast.appliance.service_manager import ServiceManager
 from holdfast.cli.configuration import load_or_exit, load_whole
@@ -101,6 +101,8 @@ def serve(
     log_lines.configure(config.log.level, config.log.format)
     for warning in config.warnings:
         log_lines.write(logging.WARNING, "config_warning", warning=str(warning))
+    if file is not None and is_run(file):
+        _fail_as_run(file)
     lengthen_switch_interval()
     allow_open_files(config, file)
     signals = control or Signals(
@@ -152,7 +154,10 @@ def serve(
 
 
 def _control(appliance: Appliance, reloading: Reloader, file: Path) -> Callable[[], object]:
-    """Opens the control socket. Returns what closes it. Without one, all the rest still works."""
+    """Opens the control socket. Returns what closes it. Without one, all the rest still works.
+
+    Exits with 1 if another process runs this configuration: both began at the same time.
+    """
     handlers: dict[str, Callable[..., Mapping[str, Any]]] = {
         "reload": reloading.ask,
         "sessions": lambda: {"sessions": appliance.sessions()},
@@ -162,8 +167,15 @@ def _control(appliance: Appliance, reloading: Reloader, file: Path) -> Callable[
     try:
         return Control(file, handlers).close
     except OSError as error:
+        if is_run(file):
+            _fail_as_run(file)
         log_lines.write(logging.WARNING, "control_unavailable", reason=str(error))
         return lambda: None
+
+
+def _fail_as_run(file: Path) -> NoReturn:
+    """Exits: two would poll the same devices, and send each value twice."""
+    fail(f"{file}: another appliance of this user runs it on this machine")
 
 
 def _greeting(appliance: Appliance, file: Path) -> str:
