@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from math import inf
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ import pytest
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt import connection, late_commands
 from holdfast.outputs.mqtt.connection import MAX_PAYLOAD_BYTES
+from holdfast.outputs.mqtt.receiver import default_client_id
 from holdfast.outputs.sparkplug.definition import Payload
 from support import mqtt_peer as mqtt
 from support import wire
@@ -70,6 +72,45 @@ def command(value: bool) -> bytes:
     made.metrics.add(name="valve", datatype=11, boolean_value=value)
     data: bytes = made.SerializeToString()
     return data
+
+
+IDENTITIES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "status": ({"status": "north/status"}, {"status": "south/status"}),
+    "topic": ({"topic": "north/{device}/{tag}"}, {}),
+    "edge node": (SETTINGS, SETTINGS | {"edge_node": "other"}),
+    "group": (SETTINGS, SETTINGS | {"group": "other"}),
+}
+"""Outputs of one name that can be at one broker, as those of two appliances of one machine."""
+
+
+@pytest.mark.parametrize("way", IDENTITIES)
+def test_outputs_that_differ_have_client_ids_that_differ(plant: Plant, way: str) -> None:
+    plant.device()
+
+    def client_id(output: dict[str, Any]) -> object:
+        plant.run(**output)
+        wire.until(lambda: "client_id" in plant.status(), "the output has begun")
+        found = plant.status()["client_id"]
+        plant.stop()
+        return found
+
+    first, second = map(client_id, IDENTITIES[way])
+    assert first != second
+    assert client_id(IDENTITIES[way][0]) == first, "it stays the same over restarts"
+
+
+@pytest.mark.parametrize("host", ["pi", "raspberry", "plant-7.example.com"])
+def test_a_default_client_id_is_not_made_too_long(
+    monkeypatch: pytest.MonkeyPatch, host: str
+) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: host)
+    plain = default_client_id("home", "")
+    assert plain == f"holdfast-home-{host}"
+    own = default_client_id("home", "north/status")
+    assert own.startswith("holdfast-home-")
+    assert (len(own) <= 23) == (len(plain) <= 23)
+    monkeypatch.setattr(socket, "gethostname", lambda: f"{host[:-1]}_")
+    assert default_client_id("home", "north/status") != own, "also of two hosts that begin alike"
 
 
 COMMANDS: dict[str, tuple[dict[str, Any], str, bytes]] = {

@@ -143,7 +143,8 @@ class MqttOutputConfig(OutputConfig, BrokerConfig):
     type: Literal["mqtt"]
     """The type of the output."""
     client_id: Annotated[MqttText | None, NotNull()] = None
-    """The client identifier. Default: holdfast, the name of the output, and that of the host."""
+    """The client identifier. Default: holdfast, the name of the output, that of the host, and a
+    digest of a status that is not the default."""
     topic: Annotated[TopicTemplate | None, NotNull()] = None
     """The topics of values. Default: plant/{device}/{tag}, with payload: device plant/{device}."""
     payload: Literal["plain", "json", "device"] = "plain"
@@ -180,7 +181,8 @@ class SparkplugConfig(OutputConfig, BrokerConfig):
     """The host without which nothing is published: values wait until it is online."""
     version: MqttVersion = "3.1.1"
     client_id: Annotated[MqttText | None, NotNull()] = None
-    """The client identifier. Default: holdfast, the name of the output, and that of the host."""
+    """The client identifier. Default: holdfast, the name of the output, that of the host, and a
+    digest of group and edge_node."""
     datatypes: Literal["births", "always"] = "births"
     """Which messages have the types of metrics. always: DDATA too, for readers without a state."""
     writes: bool = False

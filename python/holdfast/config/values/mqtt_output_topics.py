@@ -12,6 +12,12 @@ SET, REPLY = "set", "reply"
 """The levels after the topic of a tag for commands, and for replies to them."""
 
 
+STATUS = "holdfast/status"
+"""The end of the topic of an output, by default."""
+
+DEFAULT_STATUS = f"{BASE}/{STATUS}"
+
+
 class TopicNames:
     """The names of topics, from a template. Names of devices and tags are safe in topics."""
 
@@ -20,7 +26,7 @@ class TopicNames:
             template = f"{BASE}/{DEVICE}" if whole_device else f"{BASE}/{DEVICE}/{TAG}"
         self.template = template
         first = template.partition("{")[0].rstrip("/")
-        self.status = status or "/".join([*([first] if first else []), "holdfast", "status"])
+        self.status = status or "/".join([*([first] if first else []), STATUS])
         """The topic of the output itself."""
 
     def of_device(self, device: str) -> str:

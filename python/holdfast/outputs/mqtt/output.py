@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING
 
+from holdfast.config.values.mqtt_output_topics import DEFAULT_STATUS
 from holdfast.outputs.mqtt.availability import OFFLINE, ONLINE, Availability
 from holdfast.outputs.mqtt.commands import Commands
 from holdfast.outputs.mqtt.delivery import Message, packed_topic, unpacked_topic
@@ -30,9 +31,10 @@ class MqttOutput(BrokerReceiver):
     """Publishes readings."""
 
     def __init__(self, name: str, settings: MqttOutputConfig, site: Site) -> None:
-        super().__init__(name, settings)
-        self._settings, self._site = settings, site
         self._topics = settings.topics
+        status = self._topics.status
+        super().__init__(name, settings, "" if status == DEFAULT_STATUS else status)
+        self._settings, self._site = settings, site
         self._payloads = Payloads(settings)
         self._taken: list[Reading] = []
         self._messages: Sequence[Message] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import socket
 from abc import abstractmethod
 from typing import TYPE_CHECKING
@@ -18,12 +19,35 @@ if TYPE_CHECKING:
     from holdfast.runtime.stop import Stop
 
 
+MAX_PORTABLE_ID = 23
+"""Characters of a client id that each broker of MQTT 3.1.1 must take."""
+
+DIGEST_LENGTH = 6
+
+
+def default_client_id(name: str, own: str) -> str:
+    """A client id that stays the same over restarts.
+
+    Appliances of one machine may have outputs of the same name: `own` tells them apart. It does not
+    make an id too long for a broker that takes no long ones.
+    """
+    plain = f"holdfast-{name}-{socket.gethostname()}"
+    if not own:
+        return plain
+    digest = hashlib.sha256(f"{plain} {own}".encode()).hexdigest()[:DIGEST_LENGTH]
+    room = MAX_PORTABLE_ID - len(digest) - 1 if len(plain) <= MAX_PORTABLE_ID else None
+    return f"{plain[:room]}-{digest}"
+
+
 class BrokerReceiver(Receiver):
     """A receiver with a session. Connects when it is asked to send, and after an idle second."""
 
-    def __init__(self, name: str, settings: MqttOutputConfig | SparkplugConfig) -> None:
+    def __init__(
+        self, name: str, settings: MqttOutputConfig | SparkplugConfig, own: str = ""
+    ) -> None:
+        """`own`: what only this output has at the broker, if that is configured."""
         self._name, self._version = name, settings.version
-        self._client_id = settings.client_id or f"holdfast-{name}-{socket.gethostname()}"
+        self._client_id = settings.client_id or default_client_id(name, own)
         self._broker = joined(settings.host, settings.port)
         self._stop: Stop | None = None
         self._session: Session | None = None

@@ -27,7 +27,7 @@ class SparkplugOutput(BrokerReceiver):
     """Publishes readings as an edge node."""
 
     def __init__(self, name: str, settings: SparkplugConfig, site: Site) -> None:
-        super().__init__(name, settings)
+        super().__init__(name, settings, f"{settings.group}/{settings.edge_node}")
         self._settings, self._site = settings, site
         self._names = Names(settings.group, settings.edge_node)
         self._node = EdgeNode(self._names, always_typed=settings.datatypes == "always")
