@@ -665,3 +665,15 @@ def test_nothing_piles_up_while_the_broker_does_not_read(
             pass
         assert rig.registers(9, 1) == [7]
         assert running.status()["reconnects"] == 0
+
+
+def test_connections_that_are_cut_soon_have_a_likely_cause(rig: Rig, fake: FakeBroker) -> None:
+    running = run(rig, fake)
+    for _ in range(2):
+        with fake.accept() as peer:
+            peer.welcome()
+        wire.until(lambda: running.status()["last_error"] == "the connection was lost", "it ended")
+    with fake.accept() as peer:
+        peer.welcome()
+    cause = "the connection was lost; perhaps another client has client_id holdfast-test"
+    wire.until(lambda: running.status()["last_error"] == cause, "the cause")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from holdfast.net.mqtt import client
 from holdfast.outputs import sending
 from holdfast.outputs.mqtt import connection, late_commands
 from holdfast.outputs.mqtt.connection import MAX_PAYLOAD_BYTES
@@ -111,6 +112,41 @@ def test_a_default_client_id_is_not_made_too_long(
     assert (len(own) <= 23) == (len(plain) <= 23)
     monkeypatch.setattr(socket, "gethostname", lambda: f"{host[:-1]}_")
     assert default_client_id("home", "north/status") != own, "also of two hosts that begin alike"
+
+
+@pytest.mark.parametrize("output", [{}, SETTINGS], ids=["mqtt", "sparkplug"])
+def test_connections_that_are_cut_soon_have_a_likely_cause(
+    plant: Plant, fake: FakeBroker, output: dict[str, Any]
+) -> None:
+    plant.device()
+    plant.run(**output, url=fake.url, version=fake.version, client_id="plant-a")
+
+    def error() -> str:
+        return str(plant.status()["last_error"])
+
+    for _ in range(2):
+        with fake.accept() as peer:
+            until(peer, mqtt.SUBSCRIBE if output else mqtt.PUBLISH, b"")
+        wire.until(lambda: "connection" in error(), "it noticed")
+        assert "another client" not in error()
+    with fake.accept() as peer:
+        until(peer, mqtt.SUBSCRIBE if output else mqtt.PUBLISH, b"")
+    wire.until(
+        lambda: error().endswith("; perhaps another client has client_id plant-a"), "the cause"
+    )
+
+
+def test_connections_that_have_lasted_are_not_cut_soon(
+    plant: Plant, fake: FakeBroker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(client, "SOON_S", 0.0)
+    plant.device()
+    plant.run(url=fake.url, version=fake.version)
+    for _ in range(4):
+        with fake.accept() as peer:
+            until(peer, mqtt.PUBLISH, b"")
+    with fake.accept():
+        assert "another client" not in str(plant.status()["last_error"])
 
 
 COMMANDS: dict[str, tuple[dict[str, Any], str, bytes]] = {

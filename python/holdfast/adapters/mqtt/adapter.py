@@ -16,6 +16,7 @@ from holdfast.adapters.mqtt.sessions import session_of
 from holdfast.adapters.mqtt.subscriptions import Subscriptions
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
+from holdfast.net.mqtt.client import ClientId
 from holdfast.net.mqtt.dial import CONNACK_TIMEOUT_S
 from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secure_channel import failure_text
@@ -73,6 +74,7 @@ class Mqtt:
         session = session_of(self._broker, settings.client_id)
         self._subscriptions = Subscriptions(settings, mapped or {}, session.known, restored)
         self._unreleased = session.unreleased
+        self._client_id = ClientId(settings.client_id)
         self._failures = _Failures(self._broker)
         self._connected_at: float | None = None
         self._connects = 0
@@ -122,7 +124,7 @@ class Mqtt:
         finally:
             if link is not None:
                 link.close()
-            held = self._ended()
+            held = self._ended(link)
         return held
 
     def _link(self, waiter: Waiter) -> BrokerConnection:
@@ -155,12 +157,14 @@ class Mqtt:
             link.loop_misc()
         self._ending = link.trouble or self._ending
 
-    def _ended(self) -> float:
+    def _ended(self, link: BrokerConnection | None) -> float:
         """Logs the end of a connection or attempt. Returns the seconds that it was connected."""
         began, self._connected_at = self._connected_at, None
         reason = self._ending or "the broker closed the connection"
         self._subscriptions.ended()
         if reason != "stopped":
+            if began is not None and link is not None:
+                reason = self._client_id.explained(reason, link)
             self._last_error = reason
         if began is not None:
             level = logging.INFO if reason == "stopped" else logging.WARNING

@@ -6,6 +6,7 @@ socket and put into it by the derived classes.
 
 from __future__ import annotations
 
+import time
 from typing import TYPE_CHECKING, Any, Protocol
 
 from paho.mqtt.client import Client
@@ -28,6 +29,13 @@ if TYPE_CHECKING:
     from holdfast.net.mqtt.broker_socket import BrokerSocket
     from holdfast.net.mqtt.selector import Waiter
     from holdfast.net.tls import Tls
+
+
+SOON_S = 30.0
+"""Seconds after which a connection has lasted. Clients wait less before they connect again."""
+
+MAX_CUT_SOON = 2
+"""Connections in a row that a broker or a network may cut soon, as when it is restarted."""
 
 
 class BrokerSettings(Protocol):
@@ -94,6 +102,7 @@ class BrokerClient(Client):
         """Why the connection ends, or the last error that paho logged."""
         self.is_accepted = False
         """Whether the broker has accepted the connection."""
+        self._accepted_at = 0.0
         self.on_accepted: Callable[[bool], None] | None = None
         """Called then, with whether the broker resumes a session."""
         self.on_connect = self._connected
@@ -124,6 +133,13 @@ class BrokerClient(Client):
     def is_open(self) -> bool:
         """Whether the connection has begun and has not ended."""
         return self._connection is not None and self._connection.is_open
+
+    @property
+    def was_cut_soon(self) -> bool:
+        """Whether the connection has been cut without a reason, soon after it was accepted."""
+        if not self.is_accepted or self._connection is None or self._connection.failure is None:
+            return False
+        return time.monotonic() < self._accepted_at + SOON_S
 
     def accepted(self, properties: Properties | None) -> None:
         """Applies the limits from the broker's CONNACK."""
@@ -165,7 +181,7 @@ class BrokerClient(Client):
             return
         self.on_log = None
         self.accepted(properties)
-        self.is_accepted = True
+        self.is_accepted, self._accepted_at = True, time.monotonic()
         if self.on_accepted is not None:
             self.on_accepted(flags.session_present)
 
@@ -177,6 +193,24 @@ class BrokerClient(Client):
         settings = self._settings
         self._connection = dial(settings.host, settings.port, settings.tls_files, self._waiter)
         return self._connection
+
+
+class ClientId:
+    """A client id, which notices when another client seems to have it too.
+
+    The broker then ends the connection of one when the other connects. Most brokers give no reason.
+    """
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self._cut_soon = 0
+
+    def explained(self, reason: str, connection: BrokerClient) -> str:
+        """Why an accepted connection is over. Called once for each, at its end."""
+        self._cut_soon = self._cut_soon + 1 if connection.was_cut_soon else 0
+        if self._cut_soon <= MAX_CUT_SOON:
+            return reason
+        return f"{reason}; perhaps another client has client_id {self.text}"
 
 
 def _password(file: Path | None) -> bytes | None:

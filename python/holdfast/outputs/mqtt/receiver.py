@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
+from holdfast.net.mqtt.client import ClientId
 from holdfast.outputs.mqtt.delivery import unpacked_topic
 from holdfast.outputs.sending import Receiver
 
@@ -47,7 +48,7 @@ class BrokerReceiver(Receiver):
     ) -> None:
         """`own`: what only this output has at the broker, if that is configured."""
         self._name, self._version = name, settings.version
-        self._client_id = settings.client_id or default_client_id(name, own)
+        self._client_id = ClientId(settings.client_id or default_client_id(name, own))
         self._broker = joined(settings.host, settings.port)
         self._stop: Stop | None = None
         self._session: Session | None = None
@@ -63,7 +64,7 @@ class BrokerReceiver(Receiver):
         """The broker and the connection."""
         return {
             "broker": self._broker,
-            "client_id": self._client_id,
+            "client_id": self._client_id.text,
             "version": self._version,
             "reconnects": max(0, self._connects - 1),
             "not_accepted": self._not_accepted,

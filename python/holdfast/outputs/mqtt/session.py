@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from paho.mqtt.properties import Properties
 
     from holdfast.config.models.services import BrokerConfig
+    from holdfast.net.mqtt.client import ClientId
     from holdfast.net.mqtt.packets import Publish
 
 CONFIRM_TIMEOUT_S = 10.0
@@ -55,7 +56,7 @@ class Session:
     def __init__(
         self,
         settings: BrokerConfig,
-        client_id: str,
+        client_id: ClientId,
         will: Message | None,
         on_command: Callable[[Publish], None],
         on_refused: Callable[[Message, str], None],
@@ -84,9 +85,10 @@ class Session:
         self._topics: list[tuple[Sequence[str], bool]] = []
         self._reason: str | None = None
         self._is_over = False
+        self._client_id = client_id
         self._waiter = Waiter(self._end)
         try:
-            self._connection = self._opened(client_id, will)
+            self._connection = self._opened(client_id.text, will)
         except BaseException:
             self._waiter.close()
             raise
@@ -98,7 +100,7 @@ class Session:
     @property
     def error(self) -> str | None:
         """Why the connection is over; `None` if it is not."""
-        return (self._reason or "the connection was lost") if self._is_over else None
+        return self._reason if self._is_over else None
 
     def publish(self, messages: Sequence[Message]) -> Delivery:
         """Publishes messages after those before."""
@@ -220,7 +222,8 @@ class Session:
             self._reason = type(error).__name__
         finally:
             connection.close()
-            self._reason = connection.trouble or self._reason
+            reason = connection.trouble or self._reason or "the connection was lost"
+            self._reason = self._client_id.explained(reason, connection)
             self._waiter.close()
             with self._news:
                 self._is_over = True
