@@ -884,6 +884,40 @@ def test_a_write_is_told_if_another_range_is_read_meanwhile(opened: Opened, answ
         view.says(f"Written: 1 of 127.0.0.1:{device.port}.")
 
 
+@pytest.mark.parametrize("then", ["goes on", "is stopped"])
+def test_values_read_back_do_not_replace_newer_ones_of_a_watch(opened: Opened, then: str) -> None:
+    held: list[tuple[Route, Any]] = []
+
+    def hold(route: Route) -> None:
+        if held:
+            route.continue_()
+        else:
+            held.append((route, route.fetch()))
+
+    device = Registers()
+    with FakeDevice(device) as there:
+        view = opened()
+        read_registers(view, there.port)
+        view.button("Add range to view").click()
+        view.button("Read").click()
+        view.says("Holding registers 0 to 9: read in")
+        view.page.route("**/api/modbus/watch/view", hold)
+        with view.page.expect_request("**/api/modbus/watch/view"):
+            write_4711(view)
+        cell = view.row(5).get_by_role("cell").first
+        view.page.wait_for_function("() => !document.getElementById('write-dialog').open")
+        device.values[5] = 2222
+        view.button("Watch").click()
+        expect(cell).to_have_text("2222")
+        if then == "is stopped":
+            view.button("Stop").click()
+        route, old = held[0]
+        route.fulfill(response=old)
+        there_still = f": 1 of 127.0.0.1:{there.port}."
+        view.says("Written" + (there_still if then == "is stopped" else ". The watch continues."))
+        expect(cell).to_have_text("2222")
+
+
 def test_errors_before_a_write_are_told_in_plain_words(opened: Opened) -> None:
     device = Registers()
     with FakeDevice(device) as vanishing:

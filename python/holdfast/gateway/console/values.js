@@ -39,6 +39,8 @@ export class Values {
     this.panels = [];
     this.flaws = [];
     this.device = this.plots = this.watching = this.reading = this.heard = null;
+    /** Counts what reads the values of the tables: what began last has the newest. */
+    this.turn = 0;
     $("range").addEventListener("submit", (event) => {
       event.preventDefault();
       this.read(this.wanted());
@@ -300,15 +302,15 @@ export class Values {
     const told = WRITTEN[outcome];
     const { device } = panel.part;
     const isShown = () => this.panels.includes(panel) && this.device === device;
-    const tellElsewhere = () => say($("outcome"), `${told}: ${cell} of ${device.host}:${device.port}.`);
-    if (!isShown()) return tellElsewhere();
-    if (this.watching) {
-      say($("outcome"), `${told}. The watch continues.`);
-      return;
-    }
+    const tell = () => say($("outcome"), this.watching && isShown() ? `${told}. The watch continues.`
+      : `${told}: ${cell} of ${device.host}:${device.port}.`);
+    if (this.watching || !isShown()) return tell();
+    const turn = (this.turn += 1);
+    // A watch or another reading back may have begun meanwhile. Its values are newer than these.
+    const isNewest = () => isShown() && this.turn === turn;
     try {
       const data = await this.once(this.wholes);
-      if (!isShown()) return tellElsewhere();
+      if (!isNewest()) return tell();
       if (!this.fits(data)) this.show(this.wholes, data);
       this.take(data, true);
       const own = data.parts[this.wholes.indexOf(panel.whole)];
@@ -316,7 +318,7 @@ export class Values {
       const changed = `${told} and read back. Changes are marked.`;
       say($("outcome"), outcome === "written" ? changed : `${told}. The table shows the values read back.`);
     } catch (error) {
-      if (!isShown()) return tellElsewhere();
+      if (!isNewest()) return tell();
       panel.stale("Reading back failed.");
       say($("outcome"), notice(error, `${told}. Reading back failed.`));
     }
@@ -338,6 +340,7 @@ export class Values {
     this.stop();
     const stopping = new AbortController();
     this.watching = stopping;
+    this.turn += 1;
     const signature = JSON.stringify(wanted.map(parts.asked));
     this.plotted = [undefined, signature].includes(this.signature) ? plotted : [];
     this.signature = signature;
