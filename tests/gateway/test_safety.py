@@ -438,6 +438,31 @@ def test_a_page_of_another_site_can_do_nothing(headers: dict[str, str], kind: st
     assert dialed.calls == []
 
 
+@pytest.mark.parametrize(
+    "host", ["0.0.0.0", "[::]", "[::ffff:127.0.0.1]", "192.168.1.5", "[fd00::2]"]
+)
+def test_a_get_that_browsers_do_not_mark_asks_no_device(host: str) -> None:
+    """Over HTTP, a GET of another site's page to these has no header that says so."""
+    dialed = Dialed()
+    query = "host=127.0.0.1&functionCode=3&address=0"
+    with gateways.running(dialed=dialed) as running:
+        headers = {"Host": f"{host}:{running.address[1]}"}
+        answer = running.client().ask("GET", f"/api/modbus/watch?{query}", headers=headers)
+    assert (answer.status, answer.headers["holdfast-reason"]) == (403, "foreign_page")
+    assert dialed.calls == []
+
+
+def test_its_own_page_may_watch_under_the_address_of_a_network(server: holdfast.Server) -> None:
+    with gateways.running() as running:
+        host = f"192.168.1.5:{running.address[1]}"
+        headers = {**web.JSON, "Host": host, "Origin": f"http://{host}"}
+        parts = [{"functionCode": 3, "address": 0}]
+        asked = {"host": "127.0.0.1", "port": server.address[1], "parts": parts, "once": True}
+        body = json.dumps(asked).encode()
+        answer = running.client().ask("POST", "/api/modbus/watch/view", body, headers)
+    assert (answer.status, b"event: view" in answer.body) == (200, True)
+
+
 def test_its_own_page_may_ask(server: holdfast.Server) -> None:
     with gateways.running() as running:
         headers = {**web.JSON, "Origin": running.url, "Sec-Fetch-Site": "same-origin"}

@@ -14,6 +14,7 @@ from holdfast.adapters.metrics import Metrics
 from holdfast.config.models.services import MetricsConfig
 from holdfast.gateway import Gateway, Settings
 from holdfast.net.http.health import Check
+from holdfast.net.http.host_and_origin import Origins
 from holdfast.net.http.port import listen
 from holdfast.net.http.requests import Request, Response
 from support import web
@@ -121,6 +122,41 @@ def test_host_may_be_an_address_localhost_or_a_name_of_the_configuration(
 def test_another_host_is_refused_without_tokens(kind: str, host: str) -> None:
     answer = asked(application(kind), PATHS[kind], ("Host", host))
     assert (answer.status, b"a name in" in answer.body) == (403, True)
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["0.0.0.0", "[::]:8080", "[::ffff:127.0.0.1]:8080", "[::ffff:7f00:1]", "[::FFFF:10.0.0.7]"],
+)
+def test_an_address_that_browsers_do_not_take_for_this_machine_is_refused(
+    kind: str, host: str
+) -> None:
+    answer = asked(application(kind), PATHS[kind], ("Host", host))
+    told = b"Host is an unspecified or IPv4-mapped address, allowed"
+    assert (answer.status, told in answer.body) == (403, True)
+
+
+@pytest.mark.parametrize(
+    ("host", "over_http", "over_https"),
+    [
+        ("localhost:8080", True, True),
+        ("127.0.0.1:8080", True, True),
+        ("127.1.2.3", True, True),
+        ("[::1]:8080", True, True),
+        ("192.168.1.5:8080", False, True),
+        ("[fd00::2]:8080", False, True),
+        ("0.0.0.0:8080", False, False),
+        ("[::ffff:127.0.0.1]:8080", False, False),
+        (NAME, False, False),
+    ],
+)
+def test_browsers_mark_all_requests_of_other_pages_to_this_machine_and_over_https(
+    host: str, over_http: bool, over_https: bool
+) -> None:
+    request = Request("GET", "/", b"", [(b"host", host.encode())], "127.0.0.1:50000")
+    for is_https, expected in ((False, over_http), (True, over_https)):
+        origins = Origins(names={NAME}, allowed="", is_https=is_https)
+        assert origins.are_all_marked(request) is expected
 
 
 @pytest.mark.parametrize("kind", ["rest", "gateway"])

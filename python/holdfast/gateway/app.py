@@ -31,7 +31,7 @@ from holdfast.net.allow_list import AllowList
 from holdfast.net.http import health as probes
 from holdfast.net.http.application import Application, json_response
 from holdfast.net.http.events import Stream
-from holdfast.net.http.host_and_origin import Origins, is_direct
+from holdfast.net.http.host_and_origin import Origins
 from holdfast.net.http.requests import (
     BadRequest,
     BrokenBody,
@@ -340,11 +340,11 @@ class App(Application):
 
     async def watch(self, request: Request, given: Given) -> None:
         """Watches a range of a device."""
-        if not self._settings.tokens and not is_direct(request):
-            # The only GET that asks a device. Over HTTP and to a name, browsers send neither Origin
-            # nor Sec-Fetch-Site with the GET of a page.
-            detail = f"Host is a name, allowed without tokens for GET {watch.PATH}: an IP address"
-            raise BadRequest("foreign_page", f"{detail}, localhost; or use POST {views.PATH}")
+        if not self._settings.tokens and not self.origins.are_all_marked(request):
+            # The only GET that asks a device.
+            allowed = "localhost, 127.0.0.1, [::1], or an address over HTTPS"
+            detail = f"Host is not allowed without tokens for GET {watch.PATH}, allowed: {allowed}"
+            raise BadRequest("foreign_page", f"{detail}; or use POST {views.PATH}")
         with self._stream(request):
             device = RequestedDevice(self._routes, self._pool, given)
             await self._while_streaming(request, lambda stream: watch.watch(given, device, stream))

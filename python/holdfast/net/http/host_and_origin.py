@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import functools
 import re
+from ipaddress import ip_address
 from typing import TYPE_CHECKING
 
-from holdfast.net.addresses import address_in
+from holdfast.net.addresses import LOOPBACK, MAPPED, holds, unbracketed
 from holdfast.net.http.requests import BadRequest
 
 if TYPE_CHECKING:
     from collections.abc import Container
 
+    from holdfast.net.addresses import Address
     from holdfast.net.http.requests import Request
 
 _OWN = (b"same-origin", b"none")
@@ -49,8 +51,12 @@ class Origins:
         """Raises `BadRequest` for a request of another site's page, and for a name in Host."""
         if self._is_foreign(request):
             raise BadRequest("foreign_page", "the request is from a page of another site")
-        if self._names is not None and not is_direct(request, self._names):
-            raise BadRequest("foreign_page", f"Host is a name, allowed{self._allowed}")
+        if self._names is None or (host := request.header(b"host")) is None:
+            return
+        name = _name_in(host)
+        if name not in self._names and name != "localhost" and _address_in(name) is None:
+            kind = "a name" if _parsed(name) is None else "an unspecified or IPv4-mapped address"
+            raise BadRequest("foreign_page", f"Host is {kind}, allowed{self._allowed}")
 
     def admits(self, request: Request) -> bool:
         """Whether `check` finds nothing."""
@@ -59,6 +65,22 @@ class Origins:
         except BadRequest:
             return False
         return True
+
+    def are_all_marked(self, request: Request) -> bool:
+        """Whether browsers mark every request of another site's page to this Host.
+
+        Over HTTP, they send Sec-Fetch-Site to this machine only. To the address of a network, as
+        to a name, a GET may have neither that nor Origin.
+        """
+        host = request.header(b"host")
+        if host is None:
+            return True
+        name = _name_in(host)
+        address = _address_in(name)
+        is_local = address is not None and (
+            b"http" not in self._schemes or holds(LOOPBACK, address)
+        )
+        return name == "localhost" or is_local
 
     def _is_foreign(self, request: Request) -> bool:
         origins = request.values(b"origin")
@@ -70,24 +92,30 @@ class Origins:
         return any(site not in _OWN for site in request.values(b"sec-fetch-site"))
 
 
-def is_direct(request: Request, names: Container[str] = ()) -> bool:
-    """Whether Host is missing, an IP address, `localhost`, or one of `names` in lower case."""
-    host = request.header(b"host")
-    name = None if host is None else _name_in(host)
-    return name is None or name in names
-
-
 def is_from_page(request: Request) -> bool:
     """Whether a web page sent the request, also one of this server."""
     return any(request.values(name) for name in (b"origin", b"referer", b"sec-fetch-site"))
 
 
 @functools.lru_cache(maxsize=64)
-def _name_in(host: bytes) -> str | None:
-    """Returns the name in a Host header; `None` for an IP address and `localhost`.
+def _name_in(host: bytes) -> str:
+    """Returns a Host header without the port, in lower case: a name or an address."""
+    return re.sub(r":[0-9]*\Z", "", host.decode("latin-1")).lower()
 
-    An address with a zone is none: no URL has one.
+
+@functools.lru_cache(maxsize=64)
+def _address_in(name: str) -> Address | None:
+    """Returns the address that a browser names this server by; `None` for a name.
+
+    An address with a zone is none: no URL has one. An unspecified one, such as `0.0.0.0`, and an
+    IPv4-mapped one reach this machine too, but browsers do not take them for this machine.
     """
-    name = re.sub(r":[0-9]*\Z", "", host.decode("latin-1")).lower()
-    is_address = "%" not in name and address_in(name) is not None
-    return None if name == "localhost" or is_address else name
+    found = _parsed(name)
+    return None if found is None or found.is_unspecified or found in MAPPED else found
+
+
+def _parsed(name: str) -> Address | None:
+    try:
+        return None if "%" in name else ip_address(unbracketed(name))
+    except ValueError:
+        return None
