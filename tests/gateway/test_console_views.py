@@ -371,6 +371,11 @@ def test_a_value_is_checked_before_it_is_reviewed(
     cases = (
         ("float32", "21,5", "“21,5” has a decimal comma. Write 21.5 for one value"),
         ("uint16", "21,5", "has a decimal comma"),
+        ("float32", "1.234,5", "“1.234,5” has a comma between digits. Write a decimal point"),
+        ("float32", "1e3,5", "“1e3,5” has a comma between digits"),
+        ("float32", "-1,234.5", "“-1,234.5” has a comma between digits"),
+        ("float32", "1 234,5", "“234,5” has a decimal comma"),
+        ("uint16", "1,2,3", "“1,2,3” has a comma between digits"),
         ("float32", "1e40", "“1e40” does not fit float32"),
         ("float32", "1e-60", "is too small for float32"),
         ("float16", "65520", "does not fit float16"),
@@ -402,6 +407,18 @@ def test_values_are_separated_by_semicolons(opened: Opened, plant: holdfast.Memo
     view.button("Write it").click()
     view.says("Written and read back")
     assert plant.read("holding_registers", 8, 3) == [0x7BFF, 0xB800, 0x0002]
+
+
+def test_commas_that_are_clear_separate_values(opened: Opened, plant: holdfast.Memory) -> None:
+    view = connected(opened)
+    view.choose(type="uint16", address="8", quantity="6")
+    view.button("Read").click()
+    view.button("Write 8").click()
+    view.page.get_by_role("textbox", name="New value").fill("0x10,0b11,5, 7, 0xF,0x1")
+    view.button("Review").click()
+    view.button("Write it").click()
+    view.says("Written and read back")
+    assert plant.read("holding_registers", 8, 6) == [16, 3, 5, 7, 15, 1]
 
 
 def test_a_dialog_that_waits_says_so(opened: Opened) -> None:

@@ -53,14 +53,18 @@ export function bit(text) {
   throw new Error(`“${text.trim()}” is not a bit: 0, 1, on or off`);
 }
 
-/** Splits values. Throws an error for a comma that may be a decimal comma. */
+/**
+ * Splits values. Throws an error for a comma that may be a decimal comma, or one between thousands: between two digits,
+ * but not behind a word such as 0x1.
+ */
 export function separated(text) {
-  const comma = /(?<![\w.])[+-]?\d+,\d+([eE][-+]?\d+)?/.exec(text);
-  if (comma) {
-    const [whole] = comma;
-    throw new Error(`“${whole}” has a decimal comma. Write ${whole.replace(",", ".")} for one value, or ${whole.replace(",", "; ")} for two.`);
-  }
-  return text.split(/[;,]/);
+  const words = text.match(/[^\s;]+/g) ?? [];
+  const doubtful = words.find((word) => word.replace(/0(x[\da-f]+|b[01]+),/gi, "").match(/\d,\d/));
+  if (doubtful === undefined) return text.split(/[;,]/);
+  const isOne = /^[+-]?\d+,\d+([eE][-+]?\d+)?$/.test(doubtful);
+  const advice = isOne ? `Write ${doubtful.replace(",", ".")} for one value, or ${doubtful.replace(",", "; ")} for two`
+    : "Write a decimal point, nothing between thousands, and semicolons between values";
+  throw new Error(`“${doubtful}” has ${isOne ? "a decimal comma" : "a comma between digits"}. ${advice}.`);
 }
 
 /** Parses a value of a type. Returns its JSON. Throws an error for other text. */
