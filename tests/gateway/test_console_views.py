@@ -6,12 +6,16 @@ import csv
 import io
 import json
 import re
+import time
+from datetime import datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from playwright.sync_api import expect
 
+from holdfast.gateway.streams import views
 from holdfast.tags import Tag, TagList
 from support import gateway_pages
 from support.fake_device import HANG_UP, FakeDevice, registers
@@ -508,13 +512,44 @@ def test_a_plot_has_a_gap_while_there_is_no_value(opened: Opened) -> None:
         assert [row["time"] for row in rows] == sorted(row["time"] for row in rows)
 
 
-def test_a_plot_keeps_its_order_when_the_clock_is_set_back(opened: Opened) -> None:
+def test_plots_tables_and_reviews_have_the_time_of_the_gateway(opened: Opened) -> None:
+    view = connected(opened)
+    ahead = "() => { const now = Date.now; Date.now = () => now() + 3 * 3_600_000; }"
+    view.page.evaluate(ahead)
+    view.choose(quantity="8", interval="50")
+    view.button("Watch").click()
+    view.button("Plot 4").click()
+    expect(view.page.get_by_role("article").get_by_role("status")).to_have_text("1234")
+    times = []
+    for name in ("Download plots as CSV", "Download values as CSV"):
+        with view.page.expect_download() as found:
+            view.button(name).click()
+        times.append(datetime.fromisoformat(saved(found.value)[-1]["time"]))
+    assert abs(times[1] - times[0]) < timedelta(hours=1)
+    hours = "() => [0, 1].map((each) => new Date(Date.now() - 3_600_000 * (3 - each)).getHours())"
+    around = view.page.evaluate(hours)
+    for name in ("Write 4", "Write room"):
+        if name == "Write room":
+            add_tags(view, METER)
+        view.button(name).click()
+        view.page.get_by_role("textbox", name="New value").fill("21")
+        view.button("Review").click()
+        told = view.page.get_by_text("The current value was read at").inner_text()
+        view.button("Back").click()
+        view.button("Cancel").click()
+        assert int(told.rpartition(" ")[2][:2]) in around
+
+
+def test_a_plot_keeps_its_order_when_the_clock_is_set_back(
+    opened: Opened, monkeypatch: pytest.MonkeyPatch
+) -> None:
     meter = Meter()
     with FakeDevice(meter) as device:
         view = watched(opened, device.port)
         status = view.page.get_by_role("article").get_by_role("status")
         expect(status).to_have_text(re.compile(r"\d"))
-        view.page.evaluate("() => { const now = Date.now; Date.now = () => now() - 3_600_000; }")
+        set_back = SimpleNamespace(time=lambda: time.time() - 3600, perf_counter=time.perf_counter)
+        monkeypatch.setattr(views, "time", set_back)
         meter.value = 1000
         expect(status).to_have_text(re.compile(r"\d{4}"))
         with view.page.expect_download() as found:

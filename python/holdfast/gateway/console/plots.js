@@ -2,7 +2,7 @@
 
 import uPlot from "./vendor/uplot/uPlot.esm.js";
 import { save, stamp } from "./csv.js";
-import { $, clock, colour, h, onTheme, quiet } from "./dom.js";
+import { $, clock, colour, h, onTheme, quiet, stopwatch } from "./dom.js";
 import { History } from "./history.js";
 
 const SPANS = { 120: "2 minutes", 600: "10 minutes", 3600: "1 hour" };
@@ -21,7 +21,9 @@ export class Plots {
     this.place = $("plots");
     this.shown = new Map();
     this.chosen = false;
+    /** The time of the last poll in seconds, by the clock of the gateway, and what tells how long ago it was. */
     this.latest = 0;
+    this.since = stopwatch();
     this.told = h("p", { class: "dim", role: "status" });
     this.place.replaceChildren(h("div", { class: "bar" }, ...this.chooser(),
       h("label", {}, "Time span", this.spans()),
@@ -93,17 +95,19 @@ export class Plots {
     if (!this.chosen && !this.shown.has(key) && this.shown.size < AUTOMATIC) this.add(key);
   }
 
-  /** Returns the time in seconds. If the clock was set back, what is plotted moves with it, and keeps its order. */
+  /** Returns the time in seconds, by the clock of the gateway. */
   now() {
-    const time = Date.now() / 1000;
-    if (time < this.latest) this.shown.forEach((plot) => plot.history.move(time - this.latest));
-    this.latest = time;
-    return time;
+    return this.latest + this.since() / 1000;
   }
 
-  /** Takes the values of a poll. A part that was not answered has a gap. */
-  poll() {
-    const time = this.now();
+  /**
+   * Takes the values of a poll, with its time in seconds. A part that was not answered has a gap. If the clock of the
+   * gateway was set back, what is plotted moves with it, and keeps its order.
+   */
+  poll(time) {
+    if (time < this.latest) this.shown.forEach((plot) => plot.history.move(time - this.latest));
+    this.latest = time;
+    this.since = stopwatch();
     for (const plot of this.shown.values()) plot.take(time);
   }
 
@@ -125,7 +129,7 @@ export class Plots {
     const plot = new Plot(this, panel, cell, panel.label(cell, this.panels.length === 1), () => this.choose(key));
     this.shown.set(key, plot);
     this.place.append(plot.root);
-    plot.take(this.now());
+    plot.take(this.latest);
     plot.show();
   }
 
@@ -198,7 +202,7 @@ class Plot {
 
   /** Shows the extremes and the gaps of the time span. */
   describe() {
-    const now = this.plots.latest;
+    const now = this.plots.now();
     const start = now - this.plots.span;
     const [times, values] = this.history.points();
     let [least, greatest] = [Infinity, -Infinity];

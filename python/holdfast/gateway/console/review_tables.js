@@ -45,9 +45,9 @@ function writtenText({ ofBits, mask, address, count }) {
 }
 
 /** Says when the current values were read, or that they can't be. */
-function readText({ count }, { time, error }) {
+function readText({ count }, { at, error }) {
   const [current, were, they] = count === 1 ? ["The current value", "was", "It"] : ["The current values", "were", "They"];
-  return error ? `${current} can't be read. ${they} can still be overwritten.` : `${current} ${were} read at ${clock(time)}.`;
+  return error ? `${current} can't be read. ${they} can still be overwritten.` : `${current} ${were} read at ${clock(at)}.`;
 }
 
 /** Names the bit of a mask. The console writes masks of one bit only. */

@@ -437,8 +437,8 @@ export class Values {
       else panel.fresh(data.time, this.watching === null);
     });
     if (this.watching && this.plots) {
+      this.plots.poll(data.time / 1000);
       for (const [panel, cell] of changed) this.plots.changed(panel, cell);
-      this.plots.poll();
     }
     if (this.watching) this.report(errors);
   }

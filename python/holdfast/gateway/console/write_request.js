@@ -1,6 +1,6 @@
 // A write: the values that are typed, the request that sends them, and the registers or coils that it changes.
 
-import { post, Problem } from "./api.js";
+import { answer, post, Problem, sendJson } from "./api.js";
 import { bit, literal, register, separated, swapsBytes } from "./numbers.js";
 import { same } from "./parts.js";
 import { areaOf, MAX_WORD } from "./standard.js";
@@ -45,7 +45,10 @@ class Change {
       : [`/api/modbus/write/${one}s`, { ...about, values: words }];
   }
 
-  /** Reads what the device has now: the words, the texts of the typed values, and the time. */
+  /**
+   * Reads what the device has now: the words, the texts of the typed values, and the time: `at` by the clock of the
+   * gateway, as in the tables, and `time` by that of the browser.
+   */
   async read(signal) {
     const found = await (this.tag ? this.readTag(signal) : this.readRange(signal));
     return { ...found, time: Date.now() };
@@ -57,8 +60,9 @@ class Change {
 
   async readRange(signal) {
     const body = { ...this.device, ...this.range(), ...this.typed };
-    const { values, typedText = [] } = await post("/api/modbus/read", body, signal);
-    return { words: values, texts: typedText };
+    const reply = await sendJson("/api/modbus/read", body, { signal, extraTime: this.device.timeout });
+    const { values, typedText = [] } = await answer(reply);
+    return { words: values, texts: typedText, at: Date.parse(reply.headers.get("Date")) };
   }
 
   /** Reads the value of a tag, which may be scaled by a register, and its words. */
@@ -67,12 +71,12 @@ class Change {
     const body = { ...this.device, parts, once: true };
     let found = null;
     const extraTime = parts.length * this.device.timeout;
-    await stream("/api/modbus/watch/view", body, { signal, extraTime }, (_, data) => (found = data.parts));
+    await stream("/api/modbus/watch/view", body, { signal, extraTime }, (_, data) => (found = data));
     if (found === null) throw new Problem("gateway_gone", "the gateway sent no value");
-    const [own, words] = found;
+    const [own, words] = found.parts;
     checkDefinition(this.tag, own.tags[0]);
     if (words.error) throw new Problem(words.reason, words.error, words.code);
-    return { words: words.values, texts: [own.error ?? own.errors[0] ?? own.texts[0]] };
+    return { words: words.values, texts: [own.error ?? own.errors[0] ?? own.texts[0]], at: found.time };
   }
 }
 
