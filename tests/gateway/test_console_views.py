@@ -155,6 +155,29 @@ def test_lists_that_are_too_large_together_are_not_added(opened: Opened) -> None
     view.says("1000 tags: read in")
 
 
+@pytest.mark.parametrize("leave", ["Cancel", "Escape"])
+def test_a_list_is_not_added_after_its_dialog_was_closed(opened: Opened, leave: str) -> None:
+    view = connected(opened)
+    view.page.route("**/api/gateway/tags", lambda _: None)
+    view.button("Add tag list…").click()
+    box = view.page.get_by_role("textbox", name="YAML or CSV")
+    box.fill(METER)
+    with view.page.expect_request("**/api/gateway/tags"):
+        view.button("Add").click()
+    with view.page.expect_event("requestfailed"):
+        if leave == "Cancel":
+            view.button("Cancel").click()
+        else:
+            view.page.keyboard.press("Escape")
+    view.page.unroute("**/api/gateway/tags")
+    view.button("Add tag list…").click()
+    expect(view.page.locator("#tags-error")).to_be_empty()
+    box.fill("name,area,address,type\na,hr,0,uint16\n")
+    view.button("Add").click()
+    expect(view.button("Remove 1 tag from the view")).to_be_visible()
+    expect(view.page.locator("#parts li")).to_have_count(1)
+
+
 def test_profiles_that_can_not_be_listed_are_told(opened: Opened) -> None:
     def busy(route: Route) -> None:
         body = json.dumps({"success": False, "error": "too many requests"})

@@ -13,11 +13,16 @@ export class Lists {
     this.add = add;
     this.dialog = $("tags-dialog");
     this.name = "";
+    this.closing = new AbortController();
+    this.dialog.addEventListener("close", () => this.closing.abort());
     $("tags-file").addEventListener("change", async () => {
       const [file] = $("tags-file").files;
       if (!file) return;
+      const { signal } = this.closing;
+      const text = await file.text();
+      if (signal.aborted) return;
       this.name = file.name;
-      $("tags-text").value = await file.text();
+      $("tags-text").value = text;
       $("tags-profile").value = "";
       this.adapt();
     });
@@ -32,14 +37,17 @@ export class Lists {
   /** Opens the dialog, with the profiles of the configuration. */
   async ask() {
     this.name = "";
+    this.closing = new AbortController();
+    const { signal } = this.closing;
     $("tags-file").value = $("tags-text").value = $("tags-error").textContent = "";
     $("tags-profile").replaceChildren(h("option", { value: "" }, "None: the text below"));
     this.adapt();
     this.dialog.showModal();
     const { profiles } = await get("/api/gateway/profiles").catch((error) => {
-      $("tags-error").textContent = `The profiles of the configuration can't be listed: ${error.message}`;
+      if (!signal.aborted) $("tags-error").textContent = `The profiles of the configuration can't be listed: ${error.message}`;
       return { profiles: [] };
     });
+    if (signal.aborted) return;
     $("tags-profile").append(...profiles.map(({ name, tags }) => h("option", { value: name }, `${name} (${tags} tags)`)));
     this.adapt();
   }
@@ -50,18 +58,20 @@ export class Lists {
     for (const id of ["tags-file", "tags-text"]) $(id).closest("label").hidden = $("tags-profile").value !== "";
   }
 
-  /** Lets the gateway check the list, and adds it. */
+  /** Lets the gateway check the list, and adds it unless the dialog was closed meanwhile. */
   async take() {
+    const { signal } = this.closing;
     const profile = $("tags-profile").value;
     const text = $("tags-text").value;
     const source = profile ? { profile } : { tags: text, format: formatOf(this.name, text) };
     $("tags-error").textContent = "";
     try {
-      const { tags } = await post("/api/gateway/tags", source);
+      const { tags } = await post("/api/gateway/tags", source, signal);
+      if (signal.aborted) return;
       this.add(list(profile || this.name || `${tags.length} ${tags.length === 1 ? "tag" : "tags"}`, source));
       this.dialog.close();
     } catch (error) {
-      $("tags-error").textContent = error.message;
+      if (!signal.aborted) $("tags-error").textContent = error.message;
     }
   }
 }
