@@ -453,11 +453,21 @@ def test_a_dialog_that_waits_says_so(opened: Opened) -> None:
     view.choose(type="uint16")
     view.button("Read").click()
     view.says("read in")
-    view.page.route("**/api/modbus/read", lambda _: None)
+    held: list[Route] = []
+    view.page.route("**/api/modbus/read", lambda route: held.append(route))
     view.button("Write 4").click()
-    view.page.get_by_role("textbox", name="New value").fill("5")
-    view.button("Review").click()
+    value = view.page.get_by_role("textbox", name="New value")
+    value.fill("5")
+    with view.page.expect_request("**/api/modbus/read"):
+        view.button("Review").click()
     view.says("Reading the current value…")
+    # What would be typed now is not in the review.
+    expect(value).not_to_be_editable()
+    expect(view.page.locator("#write-as")).to_be_disabled()
+    held[0].continue_()
+    view.button("Back").click()
+    expect(value).to_be_editable()
+    expect(view.page.locator("#write-as")).to_be_enabled()
 
 
 def test_a_dialog_does_not_wait_for_the_one_before(opened: Opened) -> None:

@@ -85,6 +85,7 @@ export class Writer {
     $("write-error").replaceChildren();
     this.tell("");
     this.wait(asked, 0);
+    this.freeze(asked, false);
     this.back();
     this.help();
     this.dialog.showModal();
@@ -151,6 +152,11 @@ export class Writer {
     if (this.asked === asked) $("write-go").setAttribute("aria-disabled", asked.waits > 0);
   }
 
+  /** Lets nobody type what the step that runs would not see, or lets them type again. */
+  freeze(asked, is) {
+    if (this.asked === asked) $("write-value").readOnly = $("write-as").disabled = is;
+  }
+
   /** Returns to the first step because of an error: what was reviewed can't be written. */
   reject(error) {
     this.back();
@@ -161,6 +167,7 @@ export class Writer {
   async step(asked) {
     if (asked.waits > 0) return;
     this.wait(asked, 1);
+    this.freeze(asked, true);
     $("write-error").replaceChildren();
     let told = "";
     try {
@@ -170,6 +177,7 @@ export class Writer {
       if (this.isAbout(asked)) this.reject(error);
     }
     asked.sending = null;
+    this.freeze(asked, false);
     this.wait(asked, -1);
     if (this.asked === asked) this.tell(told);
   }
