@@ -11,9 +11,10 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlencode
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Error, expect
 
 from holdfast.gateway.streams import views
 from holdfast.tags import Tag, TagList
@@ -769,6 +770,44 @@ def test_what_is_left_of_a_damaged_link_is_not_watched(
     view.button("Watch").click()
     view.says("Watching ")
     expect(view.page).not_to_have_url(re.compile("plot="))
+
+
+@pytest.mark.parametrize(
+    ("damaged", "says"),
+    [
+        ("unit=300", "unit is “300”"),
+        ("unit=", "unit is “”"),
+        ("port=65536", "port is “65536”"),
+        ("timeout=0", "timeout is “0”"),
+        ("transport=rtu", "transport is “rtu”"),
+        ("host=", "host is “”"),
+        ("unti=5", "“unti” is unknown"),
+        ("unit=5&unit=6", "unit is given more than once"),
+    ],
+)
+def test_a_damaged_device_of_a_link_is_not_connected_to(
+    opened: Opened, damaged: str, says: str
+) -> None:
+    view = opened()
+    name = damaged.partition("=")[0]
+    whole = {"host": "127.0.0.1", "port": str(view.port), "area": "3", "watch": "1"}
+    link = urlencode({key: value for key, value in whole.items() if key != name})
+    view.requests.clear()
+    view.page.goto(f"{view.gateway.url}/?again#{link}&{damaged}")
+    view.says(f"A part of the link can't be used: {says}. Nothing is watched by itself.")
+    assert not [url for url in view.requests if url.endswith("/connect")]
+    view.page.get_by_role("spinbutton", name="Unit id").fill("1")
+    view.page.get_by_role("spinbutton", name="Timeout").fill("2000")
+    view.connect()
+    view.says("The device responded")
+    expect(view.button("Watch")).to_have_attribute("aria-pressed", "false")
+    view.choose(quantity="2")
+    expect(view.page).to_have_url(re.compile("quantity=2"))
+    expect(view.page).not_to_have_url(re.compile("unti"))
+    view.page.reload()
+    view.button("Connect").click()
+    view.says("The device responded")
+    expect(view.page.get_by_text("A part of the link can't be used")).to_be_hidden()
 
 
 def test_the_link_to_the_values_leaves_that_of_the_page(opened: Opened) -> None:

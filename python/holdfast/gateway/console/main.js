@@ -47,15 +47,21 @@ async function loadGatewaySettings() {
   $("interval").min = status.limits.interval;
 }
 
-/** Gets the settings of the gateway, and connects if the page's URL has `watch=1`. */
+/** Gets the settings of the gateway, and connects if the page's URL has `watch=1` and names a device. */
 async function begin() {
+  let failed = null;
   try {
     await loadGatewaySettings();
   } catch (error) {
-    say($("connection"), notice(error));
+    failed = notice(error);
   }
   $("forget").hidden = !hasToken();
-  if ((await values.recall()) && $("device").checkValidity()) connect();
+  // The limits of some fields are settings.
+  const flaws = [...pageUrl.unfit(pageUrl.view().device), ...pageUrl.strange()];
+  const isDamaged = flaws.length > 0;
+  const isWatched = await values.recall(flaws);
+  if (failed !== null || isDamaged) say($("connection"), failed, ...(isDamaged ? values.flaws : []));
+  if (isWatched && !isDamaged && $("device").checkValidity()) connect();
 }
 
 /** Stores the device in the page's URL, so that it can be bookmarked and shared. */
@@ -64,7 +70,7 @@ function remember() {
 }
 
 function fillDeviceForm() {
-  for (const [id, value] of pageUrl.view().device) $(id).value = value;
+  pageUrl.fill(pageUrl.view().device);
   $("server-label").hidden = !isSecure();
 }
 

@@ -1,5 +1,6 @@
 // The view in the page's URL, so that it can be bookmarked, shared and reloaded.
 
+import { $ } from "./dom.js";
 import { typeOf } from "./numbers.js";
 import { list, range } from "./parts.js";
 import { areaOf, LAST_ADDRESS, TYPES } from "./standard.js";
@@ -7,6 +8,10 @@ import { areaOf, LAST_ADDRESS, TYPES } from "./standard.js";
 /** The fields of the page that are parameters with the same names. */
 const DEVICE = ["host", "port", "unit", "transport", "timeout", "server"];
 const RANGE = ["area", "address", "quantity", "type", "size", "order", "letters", "interval"];
+
+/** The other parameters, and those of them that a link may have several times. */
+const MORE = ["watch", "span"];
+const SEVERAL = ["part", "plot"];
 
 const given = () => new URLSearchParams(location.hash.slice(1));
 
@@ -24,15 +29,36 @@ export function view() {
   };
 }
 
+/** Fills in fields. A choice that there is none of changes nothing. */
+export function fill(fields) {
+  for (const [id, value] of fields) {
+    if (!$(id).options || [...$(id).options].some((each) => each.value === value)) $(id).value = value;
+  }
+}
+
+/** Names the fields that could not be filled in, and those whose value is invalid. */
+export const unfit = (fields) =>
+  fields.filter(([id, value]) => $(id).value !== value || !$(id).checkValidity()).map(([id, value]) => `${id} is “${value}”`);
+
+const unknown = (query) => [...new Set(query.keys())].filter((name) => ![...DEVICE, ...RANGE, ...MORE, ...SEVERAL].includes(name));
+
+/** Names the parameters that no link has, and those that it has once but were given several times. */
+export function strange() {
+  const query = given();
+  const repeated = [...DEVICE, ...RANGE, ...MORE].filter((name) => query.getAll(name).length > 1);
+  return [...unknown(query).map((name) => `“${name}” is unknown`), ...repeated.map((name) => `${name} is given more than once`)];
+}
+
 /** Stores the device. `valueOf` returns the value of a field, or null for one that is left out. */
 export function putDevice(valueOf) {
   put(Object.fromEntries(DEVICE.map((id) => [id, valueOf(id)])));
 }
 
-/** Stores everything but the device. `parts` are spelled, `span` may be null. */
+/** Stores everything but the device, and removes what is unknown. `parts` are spelled, `span` may be null. */
 export function putValues(valueOf, { parts, watched, plotted, span }) {
   const range = Object.fromEntries(RANGE.map((id) => [id, valueOf(id)]));
-  put({ ...range, part: parts, watch: watched ? "1" : null, plot: plotted, span });
+  const gone = Object.fromEntries(unknown(given()).map((name) => [name, null]));
+  put({ ...gone, ...range, part: parts, watch: watched ? "1" : null, plot: plotted, span });
 }
 
 /** Removes that the view is watched. */

@@ -72,14 +72,11 @@ export class Values {
     this.adapt();
   }
 
-  /** Fills in the view of the page's URL. Returns whether it is watched. */
-  async recall() {
+  /** Fills in the view of the page's URL; `found` says what else of it can't be used. Returns whether it is watched. */
+  async recall(found) {
     const view = pageUrl.view();
-    for (const [id, value] of view.range) {
-      if (!$(id).options || [...$(id).options].some((each) => each.value === value)) $(id).value = value;
-    }
+    pageUrl.fill(view.range);
     this.adapt();
-    const found = [];
     for (const text of view.parts) {
       try {
         this.pinned.push(await pageUrl.readPart(text));
@@ -88,10 +85,7 @@ export class Values {
       }
     }
     // With parts, the range is not used, but the interval is.
-    for (const [id, value] of view.range) {
-      const isUsed = id === "interval" || view.parts.length === 0;
-      if (isUsed && ($(id).value !== value || !$(id).checkValidity())) found.push(`${id} is “${value}”`);
-    }
+    found.push(...pageUrl.unfit(view.range.filter(([id]) => id === "interval" || view.parts.length === 0)));
     this.flaws = found.map((each) => `A part of the link can't be used: ${each}. Nothing is watched by itself.`);
     this.chips();
     this.resumes = view.watched;
