@@ -793,6 +793,75 @@ def test_what_is_unsubscribed_without_jetstream_stays_so_after_a_reload(
     assert tags_by_subscription(own_caller) == wanted
 
 
+@pytest.mark.parametrize("is_read", [True, False], ids=["", "never read"])
+def test_what_is_changed_without_jetstream_and_refused_after_a_reload_is_stored(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    monkeypatch: pytest.MonkeyPatch,
+    is_read: bool,
+) -> None:
+    monkeypatch.setattr(store, "MAX_RETRY_S", 0.1)
+
+    def add(*tags: dict[str, Any]) -> None:
+        request = subscription(server, *tags, host="127.0.0.2")
+        assert own_caller.request("modbus.subscribe", request)["success"]
+
+    scanner = run_scanner(own_nats)
+    add(tag("a", 0), tag("b", 1))
+    if is_read:
+        jetstream = own_nats.restarted()
+    else:
+        scanner.stop()
+        jetstream = own_nats.restarted()
+        scanner = run_scanner(own_nats)
+    wire.until(lambda: scanner.serves, "it is connected again")
+    add(tag("c", 2))
+    assert own_caller.request("modbus.unsubscribe", leaving("a"))["success"]
+    for _ in range(2):
+        scanner.stop()
+        former = list(scanner.scanner.stored_requests())
+        scanner = run_scanner(own_nats, former=former, allow=("127.0.0.1/32",))
+        assert tags_by_subscription(own_caller) == {}
+    own_nats.restarted(*jetstream)
+    wire.until(lambda: scanner.serves, "it is connected again")
+    wanted = {("plc1", "hmi"): {"b", "c"}}
+    wire.until(lambda: stored_tags(own_caller) == wanted, "what is refused is stored")
+    scanner.stop()
+    run_scanner(own_nats)
+    wire.until(lambda: tags_by_subscription(own_caller) == wanted, "it is accepted")
+
+
+def test_a_refused_request_of_a_former_scanner_is_tried_again_and_handed_over() -> None:
+    tags = [TagRequest(id, number, "holding", "int16") for number, id in enumerate("abc")]
+    older, newer = (
+        SubscribeRequest("plc1", "hmi", each, host="127.0.0.1") for each in (tags[:2], tags[1:])
+    )
+    owner = SubscriptionKey.of(newer)
+    stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), Rules())
+    carried_out: list[SubscribeRequest] = []
+
+    class Host:
+        def lock(self, _device: str) -> asyncio.Lock:
+            return asyncio.Lock()
+
+        def is_entry(self, _owner: SubscriptionKey) -> bool:
+            return False
+
+        async def restore(self, request: SubscribeRequest) -> None:
+            carried_out.append(request)
+
+    stored._device_host = stored._host = Host()  # type: ignore[assignment]
+    stored.unsubscribed(owner.removal())
+    assert stored.retries(newer)
+    stored._on_read([("modbus.subscription.hmi.plc1.0", msgspec.json.encode(older))])
+    # Until it is stored, the next scanner must remove what only the older request has.
+    assert [*stored.removals(())] == [owner.removal(["a"])]
+    asyncio.run(stored._restore_all())
+    assert [[each.id for each in request.tags] for request in carried_out] == [["b", "c"]]
+
+
 def test_a_pending_subscription_that_a_caller_ends_meanwhile_is_not_carried_out() -> None:
     owner = SubscriptionKey("plc1", "hmi")
     carried_out: list[SubscribeRequest] = []

@@ -212,6 +212,10 @@ class Placement:
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Notes that tags of a subscription are removed."""
 
+    def retries(self, _refused: SubscribeRequest, /) -> bool:
+        """Whether it stores a refused request of a former scanner, and tries it again itself."""
+        return False
+
     def removals(self, known: Iterable[SubscriptionKey], /) -> Iterator[UnsubscribeRequest]:
         """Yields what to remove from stored subscriptions, for the next scanner of this process.
 

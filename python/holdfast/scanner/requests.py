@@ -12,7 +12,14 @@ import msgspec
 from holdfast.events import log_lines
 from holdfast.runtime.text import clip
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.jetstream.entries import is_last, joined, restored, with_later, without
+from holdfast.scanner.jetstream.entries import (
+    is_last,
+    joined,
+    restored,
+    tag_ids,
+    with_later,
+    without,
+)
 from holdfast.scanner.jetstream.entries import requests as stored_requests
 from holdfast.scanner.jetstream.entry_subscriptions import check_entry
 from holdfast.scanner.messages.decoding import Adjustments, decode_lenient
@@ -251,9 +258,14 @@ class Requests:
 
         The lock of the device is held.
         """
-        if not self.is_entry(SubscriptionKey.of(request)):
+        owner = SubscriptionKey.of(request)
+        if not self.is_entry(owner):
             await self._add_stored(request, is_stored=True)
-            self.former.pop(SubscriptionKey.of(request), None)
+            ids = {tag.id for tag in request.tags}
+            # A part of a stored subscription does not have all of their tags.
+            left = [each for each in self.former.pop(owner, ()) if tag_ids([each], {}) - ids]
+            if left:
+                self.former[owner] = left
 
     async def _add_stored(
         self, request: SubscribeRequest, *, is_stored: bool = False, renewed: bool = True

@@ -186,15 +186,14 @@ class Scanner:
         wholes = sorted(added, key=lambda whole: is_last([whole]))
         outcomes = await asyncio.gather(*map(self._restore, wholes))
         refused = [whole for whole, ok in zip(wholes, outcomes, strict=True) if not ok]
+        # Before the refused requests, which replace what is stored.
+        for removal in removals:
+            self._placement.unsubscribed(removal)
         for whole in refused:
-            if whole.ttl is None:  # Else its subscriber repeats it.
+            # The subscriber of one with a `ttl` repeats it.
+            if self._placement.retries(whole) or whole.ttl is None:
                 owner = SubscriptionKey.of(whole)
                 self._requests.former.setdefault(owner, []).append(whole)
-        stays = {SubscriptionKey.of(whole) for whole in refused}
-        for removal in removals:
-            # A refused subscription stays as it is stored: it is tried again.
-            if removal.ids is not None or SubscriptionKey.of(removal) not in stays:
-                self._placement.unsubscribed(removal)
 
     async def _restore(self, request: SubscribeRequest) -> bool:
         """Carries out a request of a former scanner. Returns whether it was accepted."""

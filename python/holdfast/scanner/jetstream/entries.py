@@ -207,15 +207,28 @@ def with_later(
     device has other subscribers. Returns nothing if the stored requests add nothing.
     """
     later = [restored(value) for value in requests(device, subscriber)]
+    kept = [key for key in SETTINGS if key not in given] if len(device.subscribers) == 1 else []
+    return replaced_by(parts, later, profiles, kept)
+
+
+def replaced_by(
+    parts: Sequence[SubscribeRequest],
+    later: Sequence[SubscribeRequest],
+    profiles: Profiles,
+    kept: Iterable[str] = (),
+) -> list[SubscribeRequest]:
+    """Returns stored requests together with later ones, which replace tags and settings.
+
+    The stored settings that are `kept` stay. Returns nothing if the stored requests add nothing.
+    """
     ids = {tag.id for each in later for tag in each.tags}
     profile = next(filter(None, (each.profile for each in (later[0], *parts))), None)
     own = [with_profile(each, profile, profiles) for each in parts]
     earlier = [[tag for tag in _ordered(each) if tag.id not in ids] for each in own]
     changes: dict[str, Any] = {"profile": profile}
-    if len(device.subscribers) == 1:
-        for key in SETTINGS:
-            if key not in given and (value := getattr(parts[0], key)) is not None:
-                changes[key] = value
+    for key in kept:
+        if (value := getattr(parts[0], key)) is not None:
+            changes[key] = value
     head = msgspec.structs.replace(later[0], **changes)
     if head == later[0] and not any(earlier):
         return []

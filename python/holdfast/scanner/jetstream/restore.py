@@ -20,6 +20,7 @@ from holdfast.scanner.jetstream.entries import (
     joined,
     number,
     numbered,
+    replaced_by,
     requests,
     resized,
     restored,
@@ -34,6 +35,7 @@ from holdfast.scanner.messages.subject_parts import subject_id
 from holdfast.scanner.messages.types import Status
 from holdfast.scanner.placement import Placement
 from holdfast.scanner.subscriptions.key import SubscriptionKey
+from holdfast.scanner.subscriptions.subscription import SETTINGS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -182,6 +184,23 @@ class StoredSubscriptions(Placement):
             pending.parts, pending.is_changed = parts, True
         self._store.touch(owner)
 
+    def retries(self, refused: SubscribeRequest, /) -> bool:
+        """Makes a refused request of a former scanner pending. What is stored is older."""
+        owner = SubscriptionKey.of(refused)
+        # Parts as they are stored: some may be accepted alone.
+        parts = [*map(restored, resized([refused], self._store.max_bytes))]
+        pending = self._pending.get(owner)
+        if pending is not None:  # Of several, the first one is the newest.
+            parts = replaced_by(parts, pending.parts, self._profiles) or pending.parts
+        elif self._is_known(owner):
+            assert owner.subscriber is not None
+            more = self._registry.devices[owner.device], owner.subscriber, SETTINGS
+            parts = with_later(parts, *more, self._profiles)
+        if parts:
+            self._pending[owner] = Pending(parts, set(), is_changed=True)
+            self._store.touch(owner)
+        return True
+
     def removals(self, known: Iterable[SubscriptionKey], /) -> Iterator[UnsubscribeRequest]:
         """Yields what to remove from stored subscriptions, for the next scanner of this process."""
         if not self._has_read:
@@ -259,8 +278,14 @@ class StoredSubscriptions(Placement):
                 owners[key] = owner
         if not self._has_read:
             for owner, parts in found.items():
-                if left := self._left(owner, parts):
-                    removed = self._changes.get(owner, Changes()).removed
+                left = self._left(owner, parts)
+                removed = self._changes.get(owner, Changes()).removed
+                if (pending := self._pending.get(owner)) is not None:
+                    # A former scanner has handed it over, and it is newer.
+                    left = left and replaced_by(left, pending.parts, self._profiles)
+                    left = left or pending.parts
+                    removed = tag_ids(parts, self._profiles) - tag_ids(left, self._profiles)
+                if left:
                     self._pending[owner] = Pending(left, removed, left != parts)
             self._changes.clear()
             self._has_read = True
