@@ -566,8 +566,7 @@ def test_what_is_requested_before_the_entries_are_read_is_on_top_of_them(
     def leave(device: str, *ids: str, **more: Any) -> None:
         assert ask("modbus.unsubscribe", leaving(*ids, deviceId=device, **more))["success"]
 
-    # A reload hands the requests over with all settings.
-    settings: dict[str, int] = {} if reloads else {"timeout": 20_700}
+    settings = {"timeout": 20_700}
     devices = "same", "more", "fewer", "ended", "begun anew", "moved", "shared", "untouched"
     first = run_scanner(own_nats)
     for each in devices:
@@ -610,8 +609,7 @@ def test_what_is_requested_before_the_entries_are_read_is_on_top_of_them(
     run_scanner(own_nats)
     wire.until(lambda: tags_by_subscription(own_caller) == wanted, "they are restored")
     assert device(own_caller, "moved")["url"].startswith("tcp://127.0.0.2:")
-    if not reloads:
-        assert device(own_caller, "more")["timeout"] == 20_700
+    assert device(own_caller, "more")["timeout"] == 20_700
 
 
 def test_the_dialect_of_whole_subscriptions_replaces_what_is_not_read_yet(
@@ -804,12 +802,12 @@ def test_what_is_changed_without_jetstream_and_refused_after_a_reload_is_stored(
 ) -> None:
     monkeypatch.setattr(store, "MAX_RETRY_S", 0.1)
 
-    def add(*tags: dict[str, Any]) -> None:
-        request = subscription(server, *tags, host="127.0.0.2")
+    def add(*tags: dict[str, Any], **more: Any) -> None:
+        request = subscription(server, *tags, host="127.0.0.2", **more)
         assert own_caller.request("modbus.subscribe", request)["success"]
 
     scanner = run_scanner(own_nats)
-    add(tag("a", 0), tag("b", 1))
+    add(tag("a", 0), tag("b", 1), timeout=20_700, release=True)
     if is_read:
         jetstream = own_nats.restarted()
     else:
@@ -817,7 +815,7 @@ def test_what_is_changed_without_jetstream_and_refused_after_a_reload_is_stored(
         jetstream = own_nats.restarted()
         scanner = run_scanner(own_nats)
     wire.until(lambda: scanner.serves, "it is connected again")
-    add(tag("c", 2))
+    add(tag("c", 2), release=False)
     assert own_caller.request("modbus.unsubscribe", leaving("a"))["success"]
     for _ in range(2):
         scanner.stop()
@@ -828,6 +826,8 @@ def test_what_is_changed_without_jetstream_and_refused_after_a_reload_is_stored(
     wire.until(lambda: scanner.serves, "it is connected again")
     wanted = {("plc1", "hmi"): {"b", "c"}}
     wire.until(lambda: stored_tags(own_caller) == wanted, "what is refused is stored")
+    settings = {(each["timeout"], each["release"]) for each in subscriptions(own_caller).values()}
+    assert settings == {(20_700, False)}
     scanner.stop()
     run_scanner(own_nats)
     wire.until(lambda: tags_by_subscription(own_caller) == wanted, "it is accepted")

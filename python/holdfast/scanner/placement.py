@@ -216,6 +216,10 @@ class Placement:
         """Whether it stores a refused request of a former scanner, and tries it again itself."""
         return False
 
+    def handed_over(self, request: SubscribeRequest, /) -> SubscribeRequest:
+        """Returns the request of a known subscription as the next scanner is to have it."""
+        return request
+
     def removals(self, known: Iterable[SubscriptionKey], /) -> Iterator[UnsubscribeRequest]:
         """Yields what to remove from stored subscriptions, for the next scanner of this process.
 

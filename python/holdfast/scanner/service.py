@@ -224,7 +224,8 @@ class Scanner:
         yield from self._placement.removals(owner for owner, _ in known)
         for owner, device in known:
             assert owner.subscriber is not None
-            yield joined([*map(restored, requests(device, owner.subscriber))])
+            whole = joined([*map(restored, requests(device, owner.subscriber))])
+            yield self._placement.handed_over(whole)
         # Last: a refused one must not displace one that is carried out.
         yield from chain.from_iterable(self._requests.former.values())
 

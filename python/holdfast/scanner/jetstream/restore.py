@@ -95,6 +95,8 @@ class StoredSubscriptions(Placement):
         self._prefix = prefix
         self._registry = registry
         self._profiles = rules.profiles
+        self._defaults = {"timeout": rules.defaults.timeout, "release": False, "plan": None}
+        """The `SETTINGS` of a device that no request has given."""
         self._dialect = rules.dialect
         self._changes: dict[SubscriptionKey, Changes] = {}
         """What subscribers change before the stored requests are read."""
@@ -187,6 +189,8 @@ class StoredSubscriptions(Placement):
     def retries(self, refused: SubscribeRequest, /) -> bool:
         """Makes a refused request of a former scanner pending. What is stored is older."""
         owner = SubscriptionKey.of(refused)
+        if (changes := self._changes_of(owner)) is not None:
+            changes.given |= {key for key in SETTINGS if getattr(refused, key) is not None}
         # Parts as they are stored: some may be accepted alone.
         parts = [*map(restored, resized([refused], self._store.max_bytes))]
         pending = self._pending.get(owner)
@@ -200,6 +204,23 @@ class StoredSubscriptions(Placement):
             self._pending[owner] = Pending(parts, set(), is_changed=True)
             self._store.touch(owner)
         return True
+
+    def handed_over(self, request: SubscribeRequest, /) -> SubscribeRequest:
+        """Returns the request of a known subscription without defaults that no request has given.
+
+        They would replace the stored settings, which are not read yet.
+        """
+        device = self._registry.devices[request.device_id]
+        if self._has_read or len(device.subscribers) > 1:
+            return request
+        if (changes := self._changes_of(SubscriptionKey.of(request))) is None:
+            return request  # Which settings were given is not known.
+        not_given = {
+            key: None
+            for key in SETTINGS
+            if key not in changes.given and getattr(request, key) == self._defaults[key]
+        }
+        return msgspec.structs.replace(request, **not_given)
 
     def removals(self, known: Iterable[SubscriptionKey], /) -> Iterator[UnsubscribeRequest]:
         """Yields what to remove from stored subscriptions, for the next scanner of this process."""
@@ -282,7 +303,9 @@ class StoredSubscriptions(Placement):
                 removed = self._changes.get(owner, Changes()).removed
                 if (pending := self._pending.get(owner)) is not None:
                     # A former scanner has handed it over, and it is newer.
-                    left = left and replaced_by(left, pending.parts, self._profiles)
+                    given = self._changes.get(owner, Changes()).given
+                    kept = [key for key in SETTINGS if key not in given]
+                    left = left and replaced_by(left, pending.parts, self._profiles, kept)
                     left = left or pending.parts
                     removed = tag_ids(parts, self._profiles) - tag_ids(left, self._profiles)
                 if left:
