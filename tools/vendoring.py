@@ -60,8 +60,10 @@ def used(folder: Path, edges: str) -> set[tuple[str, str]]:
     systems = subprocess.check_output(["rustc", "--print", "target-list"], text=True).split()
     tree += [f"--target={system}" for system in systems]
     found = subprocess.check_output(tree, cwd=folder, text=True)
-    words = [line.split() for line in found.splitlines() if line]
-    return {(each[0], each[1].removeprefix("v")) for each in words if "holdfast" not in each[0]}
+    # Those of the source distribution itself are shown with their folder.
+    own = f"({folder.resolve()}"
+    words = [line.split() for line in found.splitlines() if line and own not in line]
+    return {(each[0], each[1].removeprefix("v")) for each in words}
 
 
 def prune(crate: Path) -> None:
