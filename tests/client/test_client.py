@@ -1537,6 +1537,27 @@ def test_a_client_is_closed_while_the_threads_of_the_application_are_busy() -> N
     run(main)
 
 
+def test_close_does_not_wait_for_a_call_that_begins_after_it() -> None:
+    async def main() -> None:
+        with Stream("rtu+tcp", silent) as device:
+            device.then = silent
+            plc = holdfast.Client(device.url, timeout=10 * wire.DEADLINE)
+            before = asyncio.create_task(plc.write_register(0, 1))
+            await asyncio.to_thread(device.await_requests, 1)
+            closing = asyncio.create_task(plc.close())
+            await asyncio.sleep(0)
+            after = asyncio.create_task(plc.write_register(0, 2))
+            await asyncio.wait_for(closing, wire.DEADLINE)
+            with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                await before
+            await asyncio.to_thread(device.await_requests, 2)
+            await plc.close()
+            with pytest.raises(holdfast.ConnectionLost, match="closed by this side"):
+                await after
+
+    run(main)
+
+
 def test_a_call_that_is_cancelled_before_its_first_byte_is_not_sent() -> None:
     with Stream("rtu+tcp") as device:
         client = BlockingClient(endpoints.endpoint(parse(device.url)))

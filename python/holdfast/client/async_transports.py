@@ -32,6 +32,7 @@ from holdfast.runtime.text import os_error_text
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
+    from concurrent.futures import Future
 
     from holdfast._core import Endpoint, Request
     from holdfast.client.base import Trace
@@ -78,6 +79,8 @@ class ThreadedConnection:
     time."""
 
     _thread: _CallThread | None = None
+    _closing: Future[None] | None = None
+    """Done when the thread before has closed the connection."""
     _loop: asyncio.AbstractEventLoop | None = None
     """The event loop that uses the thread."""
 
@@ -90,7 +93,7 @@ class ThreadedConnection:
 
     def _connect_anew(self) -> None:
         self._core = BlockingClient(self._endpoint, self._trace)
-        self._thread = None
+        self._thread = self._closing = None
 
     async def call(
         self,
@@ -108,7 +111,8 @@ class ThreadedConnection:
         if note_sent is not None:
             note_sent()  # The thread may send it at any time.
         if self._thread is None or self._thread.is_closed:  # The end of the program closes it too.
-            self._thread = _CallThread(self._core)
+            self._thread = _CallThread(self._core, self._closing)
+            self._closing = None
         return await self._thread.carry(request, unit, timeout)
 
     async def close(self) -> None:
@@ -116,6 +120,7 @@ class ThreadedConnection:
         self._here()
         thread, self._thread = self._thread, None
         if thread is not None:
+            self._closing = thread.ended
             thread.close()
             await asyncio.wrap_future(thread.ended)
 
@@ -146,12 +151,15 @@ class _CallThread(OwnThread):
     """The thread of a `ThreadedConnection`, until that is closed. Its calls have a reference to
     this, and not to that, which nobody may have any more after a cancellation."""
 
-    def __init__(self, core: BlockingClient) -> None:
+    def __init__(self, core: BlockingClient, closing: Future[None] | None) -> None:
+        """Its calls begin when the thread before is `closing` no more, so none delays that."""
         super().__init__("holdfast-client")
         self._core = core
         self.is_closed = False
         self.start()
         end_at_exit(self)
+        if closing is not None:
+            self.submit(closing.result)
 
     async def carry(self, request: Request, unit: int, timeout: float) -> Any:
         """Sends a request after the calls before it, and waits for the result."""
