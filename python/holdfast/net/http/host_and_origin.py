@@ -12,7 +12,7 @@ import re
 from ipaddress import ip_address
 from typing import TYPE_CHECKING
 
-from holdfast.net.addresses import LOOPBACK, MAPPED, holds, unbracketed
+from holdfast.net.addresses import LOOPBACK, unbracketed
 from holdfast.net.http.requests import BadRequest
 
 if TYPE_CHECKING:
@@ -55,8 +55,7 @@ class Origins:
             return
         name = _name_in(host)
         if name not in self._names and name != "localhost" and _address_in(name) is None:
-            kind = "a name" if _parsed(name) is None else "an unspecified or IPv4-mapped address"
-            raise BadRequest("foreign_page", f"Host is {kind}, allowed{self._allowed}")
+            raise BadRequest("foreign_page", f"Host is a name, allowed{self._allowed}")
 
     def admits(self, request: Request) -> bool:
         """Whether `check` finds nothing."""
@@ -70,7 +69,8 @@ class Origins:
         """Whether browsers mark every request of another site's page to this Host.
 
         Over HTTP, they send Sec-Fetch-Site to this machine only. To the address of a network, as
-        to a name, a GET may have neither that nor Origin.
+        to a name, a GET may have neither that nor Origin. Nor to an unspecified address, such as
+        `0.0.0.0`, or an IPv4-mapped one: these reach this machine, but browsers do not know it.
         """
         host = request.header(b"host")
         if host is None:
@@ -78,7 +78,7 @@ class Origins:
         name = _name_in(host)
         address = _address_in(name)
         is_local = address is not None and (
-            b"http" not in self._schemes or holds(LOOPBACK, address)
+            b"http" not in self._schemes or any(address in network for network in LOOPBACK)
         )
         return name == "localhost" or is_local
 
@@ -107,14 +107,8 @@ def _name_in(host: bytes) -> str:
 def _address_in(name: str) -> Address | None:
     """Returns the address that a browser names this server by; `None` for a name.
 
-    An address with a zone is none: no URL has one. An unspecified one, such as `0.0.0.0`, and an
-    IPv4-mapped one reach this machine too, but browsers do not take them for this machine.
+    An address with a zone is none: no URL has one.
     """
-    found = _parsed(name)
-    return None if found is None or found.is_unspecified or found in MAPPED else found
-
-
-def _parsed(name: str) -> Address | None:
     try:
         return None if "%" in name else ip_address(unbracketed(name))
     except ValueError:
