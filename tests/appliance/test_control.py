@@ -60,7 +60,7 @@ def accepting(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Accepting:  # n
 
 def pinged(file: Path) -> bool:
     try:
-        return control.ask(file, "ping", within_s=wire.DEADLINE, ping_s=wire.DEADLINE) == {}
+        return "path" in control.ask(file, "ping", within_s=wire.DEADLINE, ping_s=wire.DEADLINE)
     except control.NotRunning:
         return False
 

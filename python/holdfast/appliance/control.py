@@ -58,7 +58,7 @@ class Control:
     """Answers requests until `close`. Raises `OSError` if the socket can't be created."""
 
     def __init__(self, file: Path, handlers: Mapping[str, Handler]) -> None:
-        self._handlers: Mapping[str, Handler] = {"ping": dict, **handlers}
+        self._handlers: Mapping[str, Handler] = {"ping": lambda: {"path": _path(file)}, **handlers}
         self._closed = threading.Event()
         address, *others = _own_addresses(file)
         self._listeners = {address: _listen(address)}
@@ -130,8 +130,8 @@ def is_run(file: Path) -> bool:
     """
     if file.absolute().is_relative_to("/dev") or file.absolute().is_relative_to("/proc"):
         return False
-    with contextlib.suppress(OSError):
-        return _is_alive(_own_addresses(file)[0])
+    with contextlib.suppress(NotRunning):
+        return ask(file, "ping").get("path") == _path(file)
     return False
 
 
@@ -302,13 +302,17 @@ def _folders_of_others() -> Iterator[Path]:
                 yield folder
 
 
+def _path(file: Path) -> str:
+    return os.path.normpath(file.absolute())
+
+
 def _names(file: Path) -> list[str]:
     """The names for a path as it is given, and for the file that its symbolic links lead to.
 
     The first one stays the same when a link is replaced, the second one finds an appliance that was
     started with another path to the same file.
     """
-    paths = dict.fromkeys((os.path.normpath(file.absolute()), str(file.resolve())))
+    paths = dict.fromkeys((_path(file), str(file.resolve())))
     digests = [hashlib.sha256(os.fsencode(path)).hexdigest()[:16] for path in paths]
     if sys.platform == "win32":
         return [rf"\\.\pipe\holdfast-{digest}" for digest in digests]
