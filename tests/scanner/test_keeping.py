@@ -16,7 +16,7 @@ from nats.js import JetStreamContext
 from nats.js.kv import KeyValue
 
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.jetstream import entries, restore, store
+from holdfast.scanner.jetstream import changes_before_read, entries, restore, store
 from holdfast.scanner.jetstream.restore import StoredSubscriptions
 from holdfast.scanner.jetstream.store import BUCKET
 from holdfast.scanner.messages.types import SubscribeRequest, TagRequest
@@ -753,8 +753,8 @@ def test_a_tag_of_a_pending_subscription_that_is_left_without_jetstream_stays_so
 
 
 def test_what_is_remembered_without_jetstream_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(restore, "MAX_CHANGED", 3)
-    monkeypatch.setattr(restore, "MAX_REMOVED_IDS", 5)
+    monkeypatch.setattr(changes_before_read, "MAX_CHANGED", 3)
+    monkeypatch.setattr(changes_before_read, "MAX_REMOVED_IDS", 5)
     stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), Rules())
     owners = [SubscriptionKey("plc1", f"s{number}") for number in range(5)]
     for ids in (["a", "b"], ["b"], [f"{number}" for number in range(1, 100)]):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from dataclasses import dataclass, field
-from itertools import islice
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -15,6 +14,7 @@ from holdfast.events import log_lines
 from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.jetstream.availability import MAX_RETRY_S
+from holdfast.scanner.jetstream.changes_before_read import ChangesBeforeRead
 from holdfast.scanner.jetstream.entries import (
     is_last,
     joined,
@@ -49,30 +49,8 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.request_rules import Rules
     from holdfast.scanner.subscriptions.subscription import Subscription
 
-MAX_CHANGED = 10_000
-"""Limit of subscriptions whose changes are remembered until the stored ones are read."""
-
-MAX_REMOVED_IDS = 100_000
-"""Limit of remembered ids of tags that they have removed, all together."""
-
 MAX_RESTORE_WAIT_S = 2.0
 """How long requests wait for stored subscriptions. After that, restoring continues."""
-
-
-@dataclass(slots=True)
-class Changes:
-    """What a subscriber changes before its stored subscription is read.
-
-    Without JetStream, it is never read. So the requests are not kept here: the registry has what
-    they add.
-    """
-
-    replaces: bool = False
-    """Whether nothing of the stored subscription is left."""
-    removed: set[str] = field(default_factory=set)
-    """The ids of removed tags."""
-    given: set[str] = field(default_factory=set)
-    """The `SETTINGS` that its requests contain."""
 
 
 @dataclass(slots=True)
@@ -98,10 +76,7 @@ class StoredSubscriptions(Placement):
         self._defaults = {"timeout": rules.defaults.timeout, "release": False, "plan": None}
         """The `SETTINGS` of a device that no request has given."""
         self._dialect = rules.dialect
-        self._changes: dict[SubscriptionKey, Changes] = {}
-        """What subscribers change before the stored requests are read."""
-        self._removed_ids = 0
-        """How many ids `_changes` has."""
+        self._changes = ChangesBeforeRead()
         self._pending: dict[SubscriptionKey, Pending] = {}
         self._has_read = False
         self._found_pending = asyncio.Event()
@@ -135,9 +110,8 @@ class StoredSubscriptions(Placement):
         """Stores a subscription that has changed, together with what is pending of it."""
         owner, given = subscription.key, subscription.given_settings
         replaces = self._dialect.replaces_subscription
-        if not self._has_read and (given or replaces) and (changes := self._changes_of(owner)):
-            changes.given |= given
-            changes.replaces |= replaces
+        if not self._has_read:
+            self._changes.requested(owner, given, replaces=replaces)
         if is_stored:
             return
         pending = self._pending.get(owner)
@@ -154,13 +128,8 @@ class StoredSubscriptions(Placement):
     def unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Removes tags of a subscription, also of a pending one."""
         owner, ids = SubscriptionKey.of(request), request.ids
-        if not self._has_read and (changes := self._changes_of(owner)):
-            if ids is None:
-                changes.replaces = True
-            else:
-                new = set(ids) - changes.removed
-                changes.removed.update(islice(new, MAX_REMOVED_IDS - self._removed_ids))
-                self._removed_ids = min(self._removed_ids + len(new), MAX_REMOVED_IDS)
+        if not self._has_read:
+            self._changes.removed(owner, ids)
         pending = self._pending.get(owner)
         if pending is None or ids is None:
             self._touch(owner)
@@ -168,12 +137,6 @@ class StoredSubscriptions(Placement):
             removed = tag_ids(pending.parts, self._profiles).intersection(ids)
             pending.removed |= removed
             self._change(owner, pending, without(pending.parts, removed, self._profiles))
-
-    def _changes_of(self, owner: SubscriptionKey) -> Changes | None:
-        """Returns where to note changes; `None` if there are too many, which are forgotten then."""
-        if len(self._changes) < MAX_CHANGED:
-            return self._changes.setdefault(owner, Changes())
-        return self._changes.get(owner)
 
     def _change(
         self, owner: SubscriptionKey, pending: Pending, parts: list[SubscribeRequest]
@@ -189,8 +152,9 @@ class StoredSubscriptions(Placement):
     def retries(self, refused: SubscribeRequest, /) -> bool:
         """Makes a refused request of a former scanner pending. What is stored is older."""
         owner = SubscriptionKey.of(refused)
-        if (changes := self._changes_of(owner)) is not None:
-            changes.given |= {key for key in SETTINGS if getattr(refused, key) is not None}
+        if not self._has_read:
+            given = [key for key in SETTINGS if getattr(refused, key) is not None]
+            self._changes.requested(owner, given)
         # Parts as they are stored: some may be accepted alone.
         parts = [*map(restored, resized([refused], self._store.max_bytes))]
         pending = self._pending.get(owner)
@@ -213,21 +177,21 @@ class StoredSubscriptions(Placement):
         device = self._registry.devices[request.device_id]
         if self._has_read or len(device.subscribers) > 1:
             return request
-        if (changes := self._changes_of(SubscriptionKey.of(request))) is None:
+        owner = SubscriptionKey.of(request)
+        if self._changes.are_forgotten(owner):
             return request  # Which settings were given is not known.
+        given = self._changes.of(owner).given
         not_given = {
             key: None
             for key in SETTINGS
-            if key not in changes.given and getattr(request, key) == self._defaults[key]
+            if key not in given and getattr(request, key) == self._defaults[key]
         }
         return msgspec.structs.replace(request, **not_given)
 
     def removals(self, known: Iterable[SubscriptionKey], /) -> Iterator[UnsubscribeRequest]:
         """Yields what to remove from stored subscriptions, for the next scanner of this process."""
         if not self._has_read:
-            for owner, changes in self._changes.items():
-                if changes.replaces or changes.removed:
-                    yield owner.removal(None if changes.replaces else list(changes.removed))
+            yield from self._changes.removals()
             return
         touched = {owner for owner in self._store.touched if owner.subscriber is not None}
         yield from super().removals((touched | {*known}) - self._pending.keys())
@@ -300,10 +264,10 @@ class StoredSubscriptions(Placement):
         if not self._has_read:
             for owner, parts in found.items():
                 left = self._left(owner, parts)
-                removed = self._changes.get(owner, Changes()).removed
+                removed = self._changes.of(owner).removed
                 if (pending := self._pending.get(owner)) is not None:
                     # A former scanner has handed it over, and it is newer.
-                    given = self._changes.get(owner, Changes()).given
+                    given = self._changes.of(owner).given
                     kept = [key for key in SETTINGS if key not in given]
                     left = left and replaced_by(left, pending.parts, self._profiles, kept)
                     left = left or pending.parts
@@ -323,7 +287,7 @@ class StoredSubscriptions(Placement):
         self, owner: SubscriptionKey, parts: list[SubscribeRequest]
     ) -> list[SubscribeRequest]:
         """Returns what to carry out of stored requests, with the later ones of their subscriber."""
-        changes = self._changes.get(owner, Changes())
+        changes = self._changes.of(owner)
         left = [] if changes.replaces else parts
         if changes.removed:
             left = without(left, changes.removed, self._profiles)
