@@ -24,6 +24,9 @@ MAX_UNIT = 0xFF
 MAX_SERIAL_UNIT = 247
 """The largest unit id, and the largest on a serial line (V1.02, 2.2)."""
 
+PRIVATE_OBJECTS = range(0x80, 0x100)
+"""The object ids of an identification that are left to makers (V1.1b3, 6.21)."""
+
 PORT = 502
 TLS_PORT = 802
 """The default ports of Modbus over TCP and UDP, and over TLS."""

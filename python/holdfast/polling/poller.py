@@ -37,9 +37,6 @@ if TYPE_CHECKING:
     from holdfast.polling.readings import DevicePoll
     from holdfast.runtime.own_thread import OwnThread
 
-TAGS = "{'flow': ('input_registers', 0, 'float32')}"
-"""An example, for errors."""
-
 SIGNAL_CHECK_S = 0.1
 """Seconds of one wait, between which signal handlers run."""
 
@@ -322,8 +319,9 @@ class Poller:
 
 def _tags(tags: Mapping[str, Tag | tuple[Any, ...]]) -> Iterator[Tag]:
     if not isinstance(tags, Mapping):
-        allowed = "a holdfast.TagList, or a tag for each name"
-        raise TypeError(f"tags is a {type(tags).__name__}, allowed: {allowed}, as in {TAGS}")
+        example = "{'flow': ('input_registers', 0, 'float32')}"
+        allowed = f"a holdfast.TagList, or a tag for each name, as in {example}"
+        raise TypeError(f"tags is a {type(tags).__name__}, allowed: {allowed}")
     for name, tag in tags.items():
         if isinstance(tag, Tag):
             yield tag if tag.name == name else replace(tag, name=name)

@@ -6,13 +6,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from holdfast._core import __version__
+from holdfast.protocol import PRIVATE_OBJECTS
 from holdfast.values.integers import as_integer
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-PRIVATE_OBJECTS = range(128, 256)
-"""The object ids that the standard leaves to makers (V1.1b3, 6.21)."""
 
 
 @dataclass(frozen=True, kw_only=True)

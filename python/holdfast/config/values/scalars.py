@@ -51,7 +51,14 @@ from holdfast.config.values.urls import parse_broker, parse_http, parse_syslog
 from holdfast.net.addresses import Network
 from holdfast.net.allow_list import AllowedNetwork, AllowEntry
 from holdfast.net.mqtt import MAX_TEXT
-from holdfast.protocol import MAX_CODE, MAX_ROLE, MAX_SERIAL_UNIT, MAX_UNIT, MAX_WORD
+from holdfast.protocol import (
+    MAX_CODE,
+    MAX_ROLE,
+    MAX_SERIAL_UNIT,
+    MAX_UNIT,
+    MAX_WORD,
+    PRIVATE_OBJECTS,
+)
 from holdfast.runtime.text import either
 from holdfast.types import Area
 
@@ -384,7 +391,9 @@ UnitId = Annotated[
 UnitIds = Annotated[int | str, Parsed(_key_of(0, MAX_UNIT))]
 SerialUnitIds = Annotated[int | str, Parsed(_key_of(1, MAX_SERIAL_UNIT, NOT_ON_A_LINE))]
 RawUnitId = Annotated[int, Parsed(_id_of("a unit id", 0, MAX_WORD), type="integer")]
-ObjectId = Annotated[int, Parsed(_id_of("an object id", 128, 255), type="integer")]
+ObjectId = Annotated[
+    int, Parsed(_id_of("an object id", PRIVATE_OBJECTS[0], PRIVATE_OBJECTS[-1]), type="integer")
+]
 FileNumber = Annotated[int, Parsed(_id_of("a file number", 1, MAX_WORD), type="integer")]
 FunctionCode = Annotated[
     int, Parsed(_id_of("a function code", 1, MAX_CODE), type="integer", minimum=1, maximum=MAX_CODE)

@@ -68,8 +68,9 @@ class Origins:
     def are_all_marked(self, request: Request) -> bool:
         """Whether browsers mark every request of another site's page to this Host.
 
-        Over HTTP, they send Sec-Fetch-Site to this machine only. To the address of a network, as
-        to a name, a GET may have neither that nor Origin. Nor to an unspecified address, such as
+        Over HTTP, they send Sec-Fetch-Site to this machine only (Fetch Metadata: to URLs that are
+        potentially trustworthy). To the address of a network, as to a name, a GET may have neither
+        that nor Origin. Nor to an unspecified address, such as
         `0.0.0.0`, or an IPv4-mapped one: these reach this machine, but browsers do not know it.
         """
         host = request.header(b"host")
