@@ -286,7 +286,7 @@ def test_what_is_stored_stays_if_the_server_takes_less(
 
     file = tmp_path / "small.conf"
     file.write_text(f"max_payload: {SMALL_PAYLOAD}\n")
-    own_nats.restarted(*own_nats._options, "-c", str(file))
+    own_nats.restarted(*own_nats.options, "-c", str(file))
     wanted = {
         ("plc1", "hmi"): {each["id"] for each in tags[1:]},
         ("large", "hmi"): {"large"},
@@ -487,7 +487,7 @@ def test_jetstream_that_fails_holds_no_request_up_and_gets_everything_later(
             assert caller.request("modbus.unsubscribe", gone)["success"]
             assert len(logged(caplog, "subscriptions_not_kept")) == 1
             bare.kill()
-            bare._options = ("-js", "-sd", str(tmp_path / "store"))
+            bare.options = ("-js", "-sd", str(tmp_path / "store"))
             bare.start()
             wire.until(lambda: len(caller.kept(BUCKET)) == 2, "it is kept")
             assert set(caller.kept(BUCKET)) == {
@@ -833,6 +833,19 @@ def test_what_is_changed_without_jetstream_and_refused_after_a_reload_is_stored(
     wire.until(lambda: tags_by_subscription(own_caller) == wanted, "it is accepted")
 
 
+class HostWithoutEntries:
+    """Stands for the scanner of stored subscriptions."""
+
+    def __init__(self) -> None:
+        self._lock = asyncio.Lock()
+
+    def lock(self, _device: str) -> asyncio.Lock:
+        return self._lock
+
+    def is_entry(self, _owner: SubscriptionKey) -> bool:
+        return False
+
+
 def test_a_refused_request_of_a_former_scanner_is_tried_again_and_handed_over() -> None:
     tags = [TagRequest(id, number, "holding", "int16") for number, id in enumerate("abc")]
     older, newer = (
@@ -842,13 +855,7 @@ def test_a_refused_request_of_a_former_scanner_is_tried_again_and_handed_over() 
     stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), Rules())
     carried_out: list[SubscribeRequest] = []
 
-    class Host:
-        def lock(self, _device: str) -> asyncio.Lock:
-            return asyncio.Lock()
-
-        def is_entry(self, _owner: SubscriptionKey) -> bool:
-            return False
-
+    class Host(HostWithoutEntries):
         async def restore(self, request: SubscribeRequest) -> None:
             carried_out.append(request)
 
@@ -866,17 +873,14 @@ def test_a_pending_subscription_that_a_caller_ends_meanwhile_is_not_carried_out(
     owner = SubscriptionKey("plc1", "hmi")
     carried_out: list[SubscribeRequest] = []
 
-    class Host:
+    class Host(HostWithoutEntries):
         def __init__(self) -> None:
-            self._lock = asyncio.Lock()
+            super().__init__()
             self.waits = asyncio.Event()
 
-        def lock(self, _device: str) -> asyncio.Lock:
+        def lock(self, device: str) -> asyncio.Lock:
             self.waits.set()
-            return self._lock
-
-        def is_entry(self, _owner: SubscriptionKey) -> bool:
-            return False
+            return super().lock(device)
 
         async def restore(self, request: SubscribeRequest) -> None:
             carried_out.append(request)
@@ -904,16 +908,10 @@ def test_a_pending_subscription_that_a_caller_ends_meanwhile_is_not_carried_out(
 def test_a_request_does_not_wait_for_all_parts_of_a_refused_subscription() -> None:
     tried: list[SubscribeRequest] = []
 
-    class Host:
+    class Host(HostWithoutEntries):
         def __init__(self) -> None:
-            self._lock = asyncio.Lock()
+            super().__init__()
             self.has_begun = asyncio.Event()
-
-        def lock(self, _device: str) -> asyncio.Lock:
-            return self._lock
-
-        def is_entry(self, _owner: SubscriptionKey) -> bool:
-            return False
 
         def give_up(self, _device: str, _reason: str) -> None: ...
 

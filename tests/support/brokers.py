@@ -137,7 +137,7 @@ class NatsServer(Broker):
         self._program = Path(sys.executable).parent / "nats-server"
         if not self._program.exists():
             missing("the program nats-server")
-        self._options = (*options, *(("-js", "-sd", str(folder / "store")) if jetstream else ()))
+        self.options = (*options, *(("-js", "-sd", str(folder / "store")) if jetstream else ()))
         super().__init__(folder)
 
     @property
@@ -147,7 +147,7 @@ class NatsServer(Broker):
     def restarted(self, *options: str) -> tuple[str, ...]:
         """Starts it again with other options; without any, JetStream is off. Returns the former."""
         self.kill()
-        former, self._options = self._options, options
+        former, self.options = self.options, options
         self.start()
         return former
 
@@ -174,7 +174,7 @@ class NatsServer(Broker):
 
     def command(self) -> list[str]:
         self._before = self.log.count(READY)
-        return [str(self._program), "-a", self.host, "-p", str(self.port), *self._options]
+        return [str(self._program), "-a", self.host, "-p", str(self.port), *self.options]
 
     def _listens(self) -> bool:
         return self.log.count(READY) > self._before
