@@ -8,8 +8,8 @@ use holdfast_engine::client::Place;
 use holdfast_engine::link::Fault;
 use holdfast_engine::poller::plan::{self, Field, PlanLimits, Strategy, Stretch};
 use holdfast_engine::poller::{
-    self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, FIRST_POLL_SPREAD,
-    ForwardSettings, Poll, Polled, Poller as Core, PollerError, ReadSettings, StatusSettings,
+    self, Batch, BlockSettings, Destination, DeviceSettings, DeviceState, ForwardSettings, Poll,
+    Polled, Poller as Core, PollerError, ReadSettings, StatusSettings,
 };
 use holdfast_memory::{Refusal, Span};
 use holdfast_protocol::pdu::limit;
@@ -118,7 +118,7 @@ impl PolledDevice {
             status: status.transpose()?,
             start_within: match start_within {
                 Some(within) => seconds("start_within", within)?,
-                None => FIRST_POLL_SPREAD.min(seconds("interval", interval)?),
+                None => poller::first_poll_spread(seconds("interval", interval)?),
             },
             report: receiver.map(|receiver| Arc::clone(&receiver.core)),
             reported_as,

@@ -33,7 +33,7 @@ pub use forwarding::{ForwardCounters, ForwardFailure, ForwardSettings};
 pub use mirror_age::MirrorAge;
 pub use remembered_refusals::RETRY_REFUSED_AFTER;
 pub use results::{Batch, BlockResult, Poll, Results, Written};
-pub use schedule::FIRST_POLL_SPREAD;
+pub use schedule::first_poll_spread;
 pub use state::{DeviceCounters, DeviceState};
 pub use status::{BlockSettings, StatusSettings};
 pub use thread::{Polled, Poller, PollerError};

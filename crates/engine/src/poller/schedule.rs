@@ -88,9 +88,13 @@ impl Schedule {
     }
 }
 
-/// The first polls of devices are spread over their interval, or over this if that is less. The scanner has a
-/// shorter time (`start_within`).
-pub const FIRST_POLL_SPREAD: Duration = Duration::from_secs(10);
+/// The longest time over which the first polls of devices are spread.
+const MAX_FIRST_POLL_SPREAD: Duration = Duration::from_secs(10);
+
+/// Over which time the first polls of devices are spread, where no other is set (`start_within`).
+pub fn first_poll_spread(interval: Duration) -> Duration {
+    interval.min(MAX_FIRST_POLL_SPREAD)
+}
 
 /// When the device with this number is polled first, after the start: the golden ratio spreads any number
 /// of devices evenly.

@@ -5,7 +5,7 @@ pub(crate) mod cut_tests;
 pub(crate) mod framing;
 mod line_echo;
 pub(crate) mod raw_ingest;
-pub(crate) mod raw_ingest_input;
+pub(crate) mod raw_ingest_buffer;
 mod rtu_line;
 pub(crate) mod secure;
 pub(crate) mod serial;

@@ -40,7 +40,7 @@ use crate::server::reports::audit::{Permit, Record, Written};
 use crate::server::reports::counters::PacketCounters;
 use crate::server::reports::event::Kind;
 use crate::server::rights::policy::{Grants, PolicyEntry};
-use crate::server::transports::raw_ingest_input::Incoming;
+use crate::server::transports::raw_ingest_buffer::Incoming;
 use crate::server::transports::secure::secured;
 use crate::server::transports::stream::{self, End, Stream, send_all};
 use crate::tls::server::ServerTls;
