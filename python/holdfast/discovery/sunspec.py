@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from holdfast.discovery.sunspec_texts import encoding_of, text_in
 from holdfast.errors import (
     ConnectFailed,
     ConnectionLost,
@@ -64,9 +65,6 @@ TYPES = {
     "float64": ("float64", None),
 }
 """The type of each SunSpec type, and the value of a point that is not implemented."""
-
-NO_TEXT = 0x8000
-"""Some devices fill the registers of a text that is not implemented with this, instead of 0."""
 
 HIDDEN = ("sunssf", "pad")
 """Types of points that are not values of their own."""
@@ -286,7 +284,7 @@ class _Group:
         name, kind, factor, unit, label, access, symbols = full
         type, missing = TYPES.get(kind, (kind, None))
         registers = self.registers[offset : offset + _size(kind)]
-        encoding = _encoding(registers) if type.startswith("string") else None
+        encoding = encoding_of(registers) if type.startswith("string") else None
         scale = self._scale(factor)
         scaled = self._number(factor) if isinstance(factor, str) and factor else None
         return Point(
@@ -321,23 +319,8 @@ def _size(kind: str) -> int:
     return 1 if kind in HIDDEN else register_count(TYPES.get(kind, (kind, None))[0])
 
 
-def _encoding(registers: Sequence[int]) -> str:
-    """UTF-8, as SunSpec has it, or Latin-1 of a device that does not follow it."""
-    try:
-        _bytes(registers).decode("utf-8")
-    except UnicodeDecodeError:
-        return "latin-1"
-    return "utf-8"
-
-
 def _value(registers: Sequence[int], type: str, missing: int | None, encoding: str | None) -> Any:
     if encoding is not None:
-        if set(registers) == {NO_TEXT}:
-            return None
-        return _bytes(registers).rstrip(b"\0 ").decode(encoding) or None
+        return text_in(registers, encoding)
     value = decode(list(registers), type)
     return None if value == missing or value != value else value
-
-
-def _bytes(registers: Sequence[int]) -> bytes:
-    return b"".join(each.to_bytes(2, "big") for each in registers)

@@ -20,6 +20,7 @@ mod clock;
 mod defaults;
 mod digests;
 mod error;
+mod late_messages;
 mod layout;
 mod lease_terms;
 mod log_reader;

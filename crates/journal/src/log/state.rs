@@ -13,6 +13,7 @@ use time::OffsetDateTime;
 use time::format_description::well_known::Rfc3339;
 
 use super::error::LogError;
+use super::late_messages::is_late;
 use super::lease_terms::LeaseTerms;
 use super::settings::is_word;
 use crate::log::stream::message::{
@@ -132,8 +133,7 @@ impl State {
         self.steps += steps.len() as u64;
         let at = |done| CarriedOut { sequence: Some(place.sequence), ..done };
         let age = age(&origin);
-        // After `Sender::deadline`. Their writers were answered `not_confirmed` long ago, and newer writes may have been confirmed since.
-        let is_late = deadline.is_some_and(|deadline| place.stored > deadline);
+        let is_late = is_late(place.stored, deadline);
         let carried_out = |step: &Step| {
             self.terms.admit(step.tenure)?;
             if is_late {

@@ -1,6 +1,7 @@
-//! What answers a request: order of checks, memory, journal, files, queues, listen only mode,
+//! What answers a request: order of checks, broadcasts, memory, journal, files, queues, listen only mode,
 //! identity.
 
+pub(crate) mod broadcast;
 pub(crate) mod exceptions;
 pub(crate) mod fifo_queue;
 pub(crate) mod file_records;

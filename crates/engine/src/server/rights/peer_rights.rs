@@ -198,30 +198,6 @@ impl PeerRights {
             || !lists_interface && is_other_interface(request)
     }
 
-    /// One unit id per memory, chosen among the `wanted` unit ids: the first one that may do what is
-    /// asked, or else the first one.
-    pub fn one_unit_of_each_memory(
-        &self,
-        wanted: impl Fn(u8) -> bool,
-        may: impl Fn(u8) -> bool,
-    ) -> Vec<u8> {
-        let mut found: Vec<(u8, &Arc<Memory>)> = Vec::new();
-        for (unit_id, unit) in (0..=u8::MAX).zip(self.units.iter()) {
-            let Some(memory) = unit.as_ref().and_then(|unit| unit.memory.as_ref()) else {
-                continue;
-            };
-            if !wanted(unit_id) {
-                continue;
-            }
-            match found.iter_mut().find(|(_, known)| Arc::ptr_eq(known, memory)) {
-                None => found.push((unit_id, memory)),
-                Some((chosen, _)) if !may(*chosen) && may(unit_id) => *chosen = unit_id,
-                Some(_) => {}
-            }
-        }
-        found.into_iter().map(|(unit_id, _)| unit_id).collect()
-    }
-
     /// Whether a function code is known and allowed for a unit; for a unit that the peer does not have,
     /// whether it is for any.
     #[inline]

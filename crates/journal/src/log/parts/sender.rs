@@ -14,6 +14,7 @@ use serde::Deserialize;
 
 use crate::log::clock::Moment;
 use crate::log::error::{End, LogError};
+use crate::log::late_messages::StreamLead;
 use crate::log::parts::in_flight::InFlight;
 use crate::log::settings::Settings;
 use crate::log::shared::Shared;
@@ -48,9 +49,7 @@ pub(in crate::log) struct Sender {
     /// Of the last message that was sent.
     counter: u64,
     in_flight: InFlight,
-    /// How far the clock of the stream is ahead of that of this machine, at least, in nanoseconds: it had
-    /// stored a message before that was applied. `None` before the first one.
-    stream_lead: Option<i64>,
+    stream_lead: StreamLead,
     /// Why the stream has refused messages, since the last one of this node was applied.
     refusal: Option<String>,
 }
@@ -113,7 +112,7 @@ impl Sender {
             start: Start::None,
             counter: 0,
             in_flight: InFlight::default(),
-            stream_lead: None,
+            stream_lead: StreamLead::default(),
             refusal: None,
         }
     }
@@ -176,9 +175,7 @@ impl Sender {
         stored: i64,
         outcomes: Vec<Outcome>,
     ) -> Result<Option<u64>, End> {
-        let lead_over = |moment: Moment| stored.saturating_sub_unsigned(moment.as_nanos());
-        // A message that arrives late says less than one before.
-        self.stream_lead = self.stream_lead.max(Some(lead_over(self.shared.now())));
+        self.stream_lead.applied(stored, self.shared.now());
         self.check_start(origin)?;
         let Some(counter) = self.own_counter(origin) else { return Ok(None) };
         self.start = Start::Applied(origin.start);
@@ -187,8 +184,7 @@ impl Sender {
         // All that the log had when it was sent comes before it, and was applied.
         if let Some(at) = sent {
             self.shared.contact(at);
-            // It was stored after it was sent. The lead was longer before the clock of the stream was set back.
-            self.stream_lead = self.stream_lead.min(Some(lead_over(at)));
+            self.stream_lead.sent(stored, at);
         }
         Ok(Some(counter))
     }
@@ -267,15 +263,10 @@ impl Sender {
         Ok(self.counter)
     }
 
-    /// When the stream may store steps at the latest that are answered at `until`, by its own clock. A cut
-    /// network can deliver them later: the system goes on sending what this process has handed over. `State::apply`
-    /// refuses what is stored later.
+    /// When the stream may store steps at the latest that are answered at `until`.
     fn deadline(&self, until: Instant) -> i64 {
-        let lead = self.stream_lead.expect("steps are taken once a message was applied");
         let left = until.saturating_duration_since(Instant::now()) + self.settings.write_timeout;
-        // The time is short by what the fastest message took to arrive.
-        lead.saturating_add_unsigned(self.shared.now().as_nanos())
-            .saturating_add(i64::try_from(left.as_nanos()).unwrap_or(i64::MAX))
+        self.stream_lead.deadline(self.shared.now(), left)
     }
 
     fn origin(&self, counter: u64) -> Origin {
