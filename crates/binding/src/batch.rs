@@ -57,9 +57,7 @@ impl Batch {
             write.pack(command, bytes)?;
             rest = behind;
         }
-        // A batch is one step, so one write that requires a seal requires it of all memories.
-        let restores = writes.iter().any(|write| write.restores);
-        let access = if restores { Access::Restore } else { Access::Ingest };
+        let access = holdfast_memory::access_of(writes.iter().map(|write| write.restores));
         let writes = writes.into_iter().map(|Pending { memory, area, address, count, .. }| {
             Checked { memory: memory.unbind(), area, address, count }
         });

@@ -22,9 +22,9 @@
 #![forbid(unsafe_code)]
 
 mod area;
-mod batch;
 mod bits;
 mod error;
+mod flattening;
 mod follower;
 mod memory;
 mod mirrored;
@@ -37,7 +37,7 @@ pub use area::{Area, Layout, Span};
 pub use error::{LayoutError, Refusal, Refused};
 pub use follower::{Change, Follower};
 pub use memory::checks::check_across;
-pub use memory::several_memories::{submit_across, write_across};
+pub use memory::several_memories::{access_of, submit_across, write_across};
 pub use memory::{Contents, Memory};
 pub use mirrored::{Freshness, Mirrored};
 pub use operation::{Access, Read, Write};

@@ -446,7 +446,7 @@ class App(Application):
     def probe(self, request: Request, _: Given) -> Response:
         """Answers a probe. It needs no token, so the answer has no names."""
         assert self._health is not None, "there is a route"
-        return probes.answer(self._health, request.path, details=False)
+        return probes.answer(self._health, request, shown_to=None)
 
     def asset(self, request: Request, _: Given) -> Response:
         """Returns a file of the console."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast import values
 from holdfast._core import Memory, Rule
 from holdfast.simulation import usual_values
-from holdfast.simulation.capacity import Capacity, nearest
+from holdfast.simulation.capacity import nearest
 from holdfast.simulation.scale_registers import RowDoesNotFit, Scales
 from holdfast.tags.scale import RegisterScale
 from holdfast.types import AREAS
@@ -73,9 +73,7 @@ class SimulatedDevice:
         self._warn = warn or (lambda _: None)
         self._counted: dict[str, float] = {}
         """The last value of each counter."""
-        self._misfits: set[str] = set()
-        """Tags whose value does not fit with the scale that a client has written."""
-        self._scales = Scales(self._content)
+        self._scales = Scales(self._content, self._warn)
         self._series: list[tuple[Tag, list[Series]]] = []
         sources = {(tag.source.area, tag.source.address) for tag in tags if tag.source is not None}
         scaled = [tag for tag in everything if tag.source is not None]
@@ -133,7 +131,7 @@ class SimulatedDevice:
             if played is not None:
                 self._scales.check_played(tag, played)
                 return usual_values.still(tag)  # Not used: what is played takes precedence.
-            found = of or usual_values.usual(self._with_scale(tag), *within)
+            found = of or usual_values.usual(self._scales.now(tag), *within)
             if found.kind == "counter":
                 least_step = self._scales.least_step(tag)
                 self._scales.check(tag, [0, found.first_count(step, least_step)])
@@ -148,10 +146,6 @@ class SimulatedDevice:
         except ValueError as error:
             raise Refused(tag.name, f"{tag.name}: {error}") from None
         return found
-
-    def _with_scale(self, tag: Tag) -> Tag:
-        """The tag with the scale that its register contains. Raises `ValueError` without one."""
-        return tag if tag.source is None else tag.with_scale(self._content(tag.source))
 
     def _content(self, source: Tag) -> Any:
         """What a register contains that has the scale of other tags."""
@@ -180,12 +174,9 @@ class SimulatedDevice:
     def _put(self, tag: Tag, value: Any) -> None:
         """Puts a value into registers that `_write` writes; without a scale, they do not change."""
         try:
-            scaled = self._with_scale(tag)
+            tag = self._scales.for_value(tag, value)
         except ValueError:
             return
-        if isinstance(tag.scale, RegisterScale):
-            self._note_misfit(Capacity(scaled, tag.scale.where), tag.name, value)
-        tag = scaled
         registers = self._registers[tag.area]
         raw: Any = (
             [nearest(tag, each) for each in value]
@@ -203,17 +194,6 @@ class SimulatedDevice:
         else:
             made = values.encode(raw, tag.type, tag.order, encoding=tag.encoding)
             registers.update(enumerate(made, tag.address))
-
-    def _note_misfit(self, capacity: Capacity, name: str, value: Any) -> None:
-        """Warns when a value begins not to fit, because a client has written its scale."""
-        try:
-            capacity.check(value)
-        except DoesNotFit as error:
-            if name not in self._misfits:
-                self._misfits.add(name)
-                self._warn(str(error))
-        else:
-            self._misfits.discard(name)
 
     def _write(self) -> None:
         writes = [

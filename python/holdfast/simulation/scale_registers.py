@@ -1,4 +1,4 @@
-"""The scales that simulated tags will have, and whether values fit with all of them."""
+"""The scales that simulated tags have and will have, and whether values fit with them."""
 
 from __future__ import annotations
 
@@ -33,11 +33,15 @@ class RowDoesNotFit(DoesNotFit):
 class Scales:
     """What registers that contain scales will contain. `content` decodes what one contains now.
 
-    That is all that is known of a register that clients write.
+    That is all that is known of a register that clients write. Values that do not fit with its
+    scale are the nearest that do, and `warn` says so.
     """
 
-    def __init__(self, content: Callable[[Tag], Any]) -> None:
+    def __init__(self, content: Callable[[Tag], Any], warn: Callable[[str], None]) -> None:
         self._content = content
+        self._warn = warn
+        self._misfits: set[str] = set()
+        """Tags whose value does not fit with the scale that a client has written."""
         self._contents: dict[tuple[Area, int], list[Any]] = {}
         self._rows: dict[tuple[Area, int], list[Any]] = {}
         """Those that are played: one for each row."""
@@ -92,6 +96,24 @@ class Scales:
         return min(
             (abs(each.scale) for each in scaled if isinstance(each.scale, int | float)), default=1
         )
+
+    def now(self, tag: Tag) -> Tag:
+        """The tag with the scale that its register contains. Raises `ValueError` without one."""
+        return tag if tag.source is None else tag.with_scale(self._content(tag.source))
+
+    def for_value(self, tag: Tag, value: Any) -> Tag:
+        """The same for a value that is written. Warns when values begin not to fit."""
+        scaled = self.now(tag)
+        if isinstance(tag.scale, RegisterScale):
+            try:
+                Capacity(scaled, tag.scale.where).check(value)
+            except DoesNotFit as error:
+                if tag.name not in self._misfits:
+                    self._misfits.add(tag.name)
+                    self._warn(str(error))
+            else:
+                self._misfits.discard(tag.name)
+        return scaled
 
     def _all_contents(self, tag: Tag) -> list[Any]:
         """Without a register for the scale, one content that is not used."""

@@ -3,12 +3,18 @@
 use std::ptr;
 use std::sync::{Arc, RwLockWriteGuard};
 
-use crate::batch::{self, Run};
 use crate::error::{Refusal, Refused};
+use crate::flattening::{self, Run};
 use crate::memory::checks::{Ranges, check_across, check_each};
 use crate::memory::{Content, Memory, Writer};
 use crate::operation::{Access, Write};
 use crate::step::{Action, Done, Journal, Step, StepWrite, wait};
+
+/// The access of a batch of data, by whether each of its writes is granted only while its memory is sealed. A batch is
+/// one step, so one such write requires a seal of all memories.
+pub fn access_of(restores: impl IntoIterator<Item = bool>) -> Access {
+    if restores.into_iter().any(|restores| restores) { Access::Restore } else { Access::Ingest }
+}
 
 /// Writes to several memories atomically: no reader sees some of the writes without the others, and
 /// when one write is refused, none is carried out. Several writes can name the same memory. Returns the
@@ -82,12 +88,12 @@ fn write_checked(writer: Writer, writes: &[(&Memory, Write<'_>)]) -> Result<(), 
         .collect();
     // The sort is stable: writes to one area of one memory keep their order.
     placed.sort_by_key(|placed| (placed.memory.rank, placed.write.area));
-    if !batch::is_large(placed.iter().map(|placed| &placed.write)) {
+    if !flattening::is_large(placed.iter().map(|placed| &placed.write)) {
         return apply_across(writer, &placed);
     }
     let flat: Vec<(&Placed, Vec<Run>)> = placed
         .chunk_by(|a, b| ptr::eq(a.memory, b.memory) && a.write.area == b.write.area)
-        .map(|writes| (&writes[0], batch::flatten(writes.iter().map(|placed| &placed.write))))
+        .map(|writes| (&writes[0], flattening::flatten(writes.iter().map(|placed| &placed.write))))
         .collect();
     let runs: Vec<Placed> = flat
         .iter()

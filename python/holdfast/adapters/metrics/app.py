@@ -114,9 +114,8 @@ class App(Application):
         return rejection(STATUSES[error.reason], error.reason, error.detail)
 
     def probe(self, request: Request, _: object) -> Response:
-        """Answers a probe with any Host header; shows details only to allowed hosts."""
-        details = self.origins.admits(request)
-        return probes.answer(self._health, request.path, details=details)
+        """Answers a probe."""
+        return probes.answer(self._health, request, shown_to=self.origins)
 
     async def export(self, request: Request, _: object) -> Response:
         """Returns the metrics.

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from holdfast.config.models.base import Model
 from holdfast.config.values.scalars import Connections, Duration, DurationOrZero
-from holdfast.server.options import DEFAULTS
+from holdfast.server.options import DEFAULTS, STREAM_DEFAULTS
 
 FEW = 16
 """So many connections from one address are not limited by default."""
@@ -21,6 +21,15 @@ def per_source(data: dict[str, Any]) -> int:
     """
     most: int = data["max_connections"]
     return max((most + 1) // 2, min(most, FEW))
+
+
+def handshakes(max_connections: int) -> int:
+    """The most connections that are not authenticated yet, beside `max_connections`.
+
+    A listener for few clients has room for strangers too, who must not displace a client's
+    handshake.
+    """
+    return max(STREAM_DEFAULTS["max_handshakes"], max_connections)
 
 
 class ConnectionLimits(Model):

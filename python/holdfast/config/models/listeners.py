@@ -11,7 +11,7 @@ from pydantic import Discriminator, Field, Strict, Tag
 
 from holdfast.client.serial_settings import Parity, Rs485, SerialTarget, stop_bits
 from holdfast.config.models.base import Model
-from holdfast.config.models.connection_limits import ConnectionLimits
+from holdfast.config.models.connection_limits import ConnectionLimits, handshakes
 from holdfast.config.models.devices import RangeConfig
 from holdfast.config.models.server_tls import ServerTlsConfig
 from holdfast.config.values.scalars import (
@@ -40,7 +40,7 @@ from holdfast.config.values.scalars import (
 )
 from holdfast.protocol import LAST_ADDRESS
 from holdfast.runtime.suggestion import suggestion
-from holdfast.server.options import DEFAULTS, STREAM_DEFAULTS
+from holdfast.server.options import DEFAULTS
 from holdfast.types import Access, BitArea
 
 FunctionList: TypeAlias = Annotated[Annotated[Codes, Field(min_length=1)] | None, NotNull()]
@@ -217,15 +217,6 @@ class _ConnectionListener(_ModbusRules, _ModbusLimits, _BoundListener):
     """Settings of all Modbus servers over TCP connections."""
 
 
-def _handshakes(max_connections: int) -> int:
-    """The most connections that are not authenticated yet, beside `max_connections`.
-
-    A listener for few clients has room for strangers too, who must not displace a client's
-    handshake.
-    """
-    return max(STREAM_DEFAULTS["max_handshakes"], max_connections)
-
-
 class RawCompatConfig(Model):
     """What old senders need that the locked raw ingest protocol does not allow."""
 
@@ -277,7 +268,7 @@ class ModbusTlsListener(_ConnectionListener):
     @property
     def max_handshakes(self) -> int:
         """The most open connections that are not authenticated yet."""
-        return _handshakes(self.max_connections)
+        return handshakes(self.max_connections)
 
 
 class ModbusRtuOverTcpListener(_ConnectionListener):
@@ -398,7 +389,7 @@ class RawIngestListener(ConnectionLimits, _BoundListener):
     @property
     def max_handshakes(self) -> int | None:
         """The most open connections that are not authenticated yet, `None` without TLS."""
-        return None if self.tls is None else _handshakes(self.max_connections)
+        return None if self.tls is None else handshakes(self.max_connections)
 
 
 Listener: TypeAlias = (

@@ -57,7 +57,7 @@ async function begin() {
   }
   $("forget").hidden = !hasToken();
   // The limits of some fields are settings.
-  const flaws = [...pageUrl.unfit(pageUrl.view().device), ...pageUrl.strange()];
+  const flaws = pageUrl.deviceFlaws();
   const isDamaged = flaws.length > 0;
   const isWatched = await values.recall(flaws);
   if (failed !== null || isDamaged) say($("connection"), failed, ...(isDamaged ? values.flaws : []));

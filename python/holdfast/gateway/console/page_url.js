@@ -43,11 +43,14 @@ export const unfit = (fields) =>
 const unknown = (query) => [...new Set(query.keys())].filter((name) => ![...DEVICE, ...RANGE, ...MORE, ...SEVERAL].includes(name));
 
 /** Names the parameters that no link has, and those that it has once but were given several times. */
-export function strange() {
+function strange() {
   const query = given();
   const repeated = [...DEVICE, ...RANGE, ...MORE].filter((name) => query.getAll(name).length > 1);
   return [...unknown(query).map((name) => `“${name}” is unknown`), ...repeated.map((name) => `${name} is given more than once`)];
 }
+
+/** Names what keeps the page from connecting by itself: what of the link may be a part of the device and can't be used. */
+export const deviceFlaws = () => [...unfit(view().device), ...strange()];
 
 /** Stores the device. `valueOf` returns the value of a field, or null for one that is left out. */
 export function putDevice(valueOf) {

@@ -15,6 +15,9 @@ from holdfast.net.http.requests import JSON, Response, response
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from holdfast.net.http.host_and_origin import Origins
+    from holdfast.net.http.requests import Request
+
 LIVE = "/health/live"
 READY = "/health/ready"
 PATHS = (LIVE, READY)
@@ -38,12 +41,14 @@ class HealthSource(Protocol):
         """Returns the checks that must all pass before clients are sent here."""
 
 
-def answer(health: HealthSource, path: str, *, details: bool = True) -> Response:
-    """Returns the response for a path of `PATHS`.
+def answer(health: HealthSource, request: Request, *, shown_to: Origins | None) -> Response:
+    """Returns the response to a request for one of `PATHS`, which may have any Host.
 
-    Without `details`, the body has only the name of each check and whether it has passed.
+    The body has the detail of each check only for hosts that `shown_to` admits. For others, it has
+    their names and whether they have passed.
     """
-    checks = health.live() if path == LIVE else health.ready()
+    checks = health.live() if request.path == LIVE else health.ready()
+    details = shown_to is not None and shown_to.admits(request)
     ok = all(check.ok for check in checks.values())
     shown = {
         name: {"ok": check.ok, "detail": check.detail} if details else {"ok": check.ok}

@@ -11,12 +11,12 @@ from holdfast import _core
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import Broker
 from holdfast.net.nats.outbox import Outbox
-from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
+from holdfast.scanner.fleet import shutdown
 from holdfast.scanner.fleet.agreement import Terms
 from holdfast.scanner.fleet.member import FleetMember
 from holdfast.scanner.fleet.nodes import NodeAnswers, OtherNodes, subject
 from holdfast.scanner.fleet.reports import FleetReports
-from holdfast.scanner.messages.types import Answer, FleetReport, ShutdownRequest
+from holdfast.scanner.messages.types import Answer, FleetReport
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Mapping
@@ -84,14 +84,7 @@ class FleetPlacement(FleetMember):
 
     def is_addressed(self, payload: bytes, /) -> bool:
         """Whether a shutdown message is for all nodes, or for this one."""
-        if payload.strip() in (b"", b"{}"):
-            return True
-        try:
-            node = msgspec.json.decode(payload, type=ShutdownRequest).node
-        except MALFORMED_JSON as error:
-            log_lines.refused("message_malformed", kind="shutdown", reason=malformed_text(error))
-            return False
-        return node == self.fleet.node
+        return shutdown.ends(payload, self.fleet.node)
 
     @property
     def writes_heartbeat(self) -> bool:
