@@ -26,6 +26,7 @@ AT = 1_700_000_000_250_000_000
         (2**63, "9.223372036854776e+18"),
         (True, "true"),
         ('a "b" \\ c', r'"a \"b\" \\ c"'),
+        ("1\n2\r3\f4\0", '"1\\\\n2\\\\r3\\\\f4\0"'),
         (b"\0\xff", '"AP8="'),
     ],
 )
@@ -33,6 +34,13 @@ def test_a_value_is_written_in_its_kind(value: Any, written: str) -> None:
     assert (
         lines([reading(value)], "modbus", {}) == f"modbus,device=pump t={written} {AT}\n".encode()
     )
+
+
+def test_a_text_can_not_begin_a_line() -> None:
+    forged = "v1\nmodbus,device=boiler power=99\nx"
+    [point] = parsed(lines([reading(forged), reading(7, tag=tag("n"))], "modbus", {}))
+    assert point.tags == {"device": "pump"}
+    assert point.fields == {"t": r"v1\nmodbus,device=boiler power=99\nx", "n": 7}
 
 
 def test_the_values_of_one_time_share_a_line() -> None:
@@ -100,7 +108,8 @@ def test_whatever_names_and_texts_are_a_parser_finds_them(
     [point] = parsed(lines(readings, measurement, {"site": site}))
     assert point.measurement == measurement
     assert point.tags == {"device": "x y", "site": site}
-    assert point.fields == {"a": text, "b": 7}
+    stored = text.replace("\n", r"\n").replace("\r", r"\r").replace("\f", r"\f")
+    assert point.fields == {"a": stored, "b": 7}
     assert point.time == AT
     found = parsed(lines([reading(number)], "m", {}))
     assert [each.fields for each in found] == ([{"t": number}] if math.isfinite(number) else [])

@@ -30,8 +30,8 @@ TAGS = {
     "on": {"area": "coils", "address": 0},
     "label": {"area": "holding_registers", "address": 8, "type": "string:8"},
 }
-LABEL = [0x6120, 0x2262, 0x222C, 0x633D]
-"""The text `a "b",c=`."""
+LABEL = [0x610A, 0x2262, 0x222C, 0x633D]
+"""The text `a "b",c=` with a newline in place of the blank."""
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def test_influxdb_has_every_value_in_its_kind(
     [last] = influx.rows('SELECT last("voltage") AS v FROM modbus GROUP BY device, site')
     assert (last["device"], last["site"], last["v"]) == ("m", "n", 230.1)
     [text] = influx.rows('SELECT last("label") AS v FROM modbus')
-    assert text["v"] == 'a "b",c='
+    assert text["v"] == r'a\n"b",c='
     [energy] = influx.rows('SELECT last("energy") AS v FROM modbus')
     assert float(energy["v"]) == float(2**63)
 

@@ -84,6 +84,8 @@ def _value(text: str, at: int) -> tuple[Any, int]:
 def _quoted(text: str, at: int) -> tuple[str, int]:
     found = ""
     while text[at] != '"':
+        if text[at] in "\n\r\f":
+            raise ValueError(f"found {text[at]!r} in a text")
         if text[at] == "\\" and text[at + 1] in '"\\':
             at += 1
         found += text[at]

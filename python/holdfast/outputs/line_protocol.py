@@ -24,7 +24,12 @@ MIN_INTEGER, MAX_INTEGER = -(2**63), 2**63 - 1
 
 _NAME = str.maketrans({",": r"\,", " ": r"\ ", "\n": r"\n", "\r": r"\r"})
 _KEY = str.maketrans({",": r"\,", " ": r"\ ", "=": r"\=", "\n": r"\n", "\r": r"\r"})
-_TEXT = str.maketrans({'"': r"\"", "\\": "\\\\"})
+_TEXT = str.maketrans({'"': r"\"", "\\": r"\\", "\n": r"\\n", "\r": r"\\r", "\f": r"\\f"})
+"""Texts come from devices. VictoriaMetrics ends a line at each newline, also within quotes: the
+values of the line would be lost, and the rest of the text could be a line of another device.
+Telegraf refuses `\\r` and `\\f`. No escape stands for these: the receiver stores a backslash and a
+letter.
+"""
 
 
 def has_field(value: Any) -> bool:

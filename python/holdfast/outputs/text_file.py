@@ -110,7 +110,7 @@ class Form(NamedTuple):
     row: re.Pattern[bytes]
     """How a row begins."""
     whole: re.Pattern[bytes]
-    """Whole rows. A text in quotes can have newlines."""
+    """Whole rows. A text in CSV can have newlines."""
 
 
 def _end_line(file: io.FileIO, path: Path, form: Form) -> None:
@@ -181,6 +181,7 @@ def _influx(readings: list[Reading]) -> bytes:
 
 
 _INFLUX = f"{MEASUREMENT},device=".encode()
+_LINES = re.compile(rb"(?:[^\n]*+\n)*+")
 
 FORMS = {
     "csv": Form(
@@ -193,15 +194,12 @@ FORMS = {
         _json_lines,
         b'{"time":',
         re.compile(rb'^\{"time":', re.MULTILINE),
-        re.compile(rb"(?:[^\n]*+\n)*+"),
+        _LINES,
     ),
     "influx": Form(
         _influx,
         _INFLUX,
         re.compile(b"^" + _INFLUX, re.MULTILINE),
-        # Quotes in names begin no text: only one behind a "=" that is not escaped does.
-        re.compile(
-            rb'(?:(?:[^"\n]++|(?<=[^\\]=)"(?:[^"\\]++|\\.)*+"|(?<![^\\]=)")*+\n)*+', re.DOTALL
-        ),
+        _LINES,
     ),
 }
