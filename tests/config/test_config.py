@@ -649,8 +649,10 @@ def test_the_schema_takes_both_forms_of_an_area() -> None:
 def test_the_schema_knows_what_a_measurement_is() -> None:
     measurement = properties(json_schema())["InfluxConfig.measurement"]
     takes = jsonschema_rs.validator_for(measurement).is_valid
-    assert all(map(takes, ["a", "a#", "\\a b", "\\#", "a\\\n"]))
-    assert not any(map(takes, ["", "#", "#a", "\\", "a\\", "a\n\\"]))
+    assert all(map(takes, ["a", "a#", "\\a b", "\\#", 'a, "b"=c']))
+    assert not any(
+        map(takes, ["", "#", "#a", "\\", "a\\", "\\ b", "a\\\\b", 'a\\"', "a\n", "a\\\n"])
+    )
 
 
 def test_the_schema_takes_null_only_where_it_means_no_limit() -> None:

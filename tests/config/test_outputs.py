@@ -58,9 +58,20 @@ DEVICE = "devices: {a: {url: tcp://a, tags: {x: {area: coils, address: 1}}, inte
         ),
         (
             "{type: influx, url: 'http://h/w', measurement: '#1 pump'}",
-            "o.measurement: found '#1 pump', allowed: text that neither begins with # nor ends in",
+            "o.measurement: found '#1 pump', allowed: text that does not begin with #, without ",
         ),
-        ("{type: influx, url: 'http://h/w', measurement: 'a\\'}", "o.measurement: found 'a"),
+        (
+            "{type: influx, url: 'http://h/w', measurement: 'M\\ 5'}",
+            r"o.measurement: found 'M\\ 5', allowed: text that does not begin with #, without ",
+        ),
+        *(
+            (
+                f"{{type: influx, url: 'http://h/w', tags: {{s: {json.dumps(text)}}}}}",
+                f"o.tags.s: found {text!r}, allowed: text without control characters, and without "
+                "a backslash at its end or before a blank",
+            )
+            for text in ('a\\"b', "C:\\", "C:\\ x", r"a\,b", r"a\=b", r"\\pc\d", "a\tb", "a\n")
+        ),
         ("{type: influx, url: 'http://h/w', tls: {}}", "o.tls: found with http://, allowed: only"),
         (
             "{type: influx, url: 'http://h/w', username: u}",

@@ -714,7 +714,7 @@ def test_a_global_tag_may_be_named_tags(imported: Callable[[str], Imported]) -> 
 
 
 def test_an_output_for_influxdb(imported: Callable[[str], Imported]) -> None:
-    tags = '[global_tags]\n  site = "north"\n  "a b" = "x"\n  device = "y"\n'
+    tags = '[global_tags]\n  site = "north"\n  "a b" = "x"\n  device = "y"\n  disk = "C:\\\\"\n'
     found = imported(REGISTER + tags + OUTPUT)
     assert found.data["outputs"] == {
         "influx": {
@@ -731,9 +731,11 @@ def test_an_output_for_influxdb(imported: Callable[[str], Imported]) -> None:
         "18: global_tags.'a b': left out: a tag of an output has 1 to 64 letters, digits, '_', '.' "
         "and '-'",
         "19: global_tags.device: left out: the tag device is the name of the device",
-        "20: outputs.influxdb_v2[0]: changed: points have the tag device in place of name, "
+        "20: global_tags.disk: left out: the value of a tag of an output is text without control "
+        'characters, and without a backslash at its end or before a blank, comma, =, " or \\',
+        "21: outputs.influxdb_v2[0]: changed: points have the tag device in place of name, "
         "slave_id, type and host: change the queries",
-        "22: outputs.influxdb_v2[0].token: check: put the token into token.txt, next to the new "
+        "23: outputs.influxdb_v2[0].token: check: put the token into token.txt, next to the new "
         "configuration",
     ]
 
@@ -805,7 +807,8 @@ def test_measurements(imported: Callable[[str], Imported]) -> None:
     assert f"{place}: left out: {several}" in notes(found)
     found = imported(metric.replace("grid", "#1") + OUTPUT)
     assert "measurement" not in found.data["outputs"]["influx"]
-    form = "a measurement is text that neither begins with # nor ends in a backslash"
+    form = "a measurement is text that does not begin with #, without control characters, and "
+    form += 'without a backslash at its end or before a blank, comma, =, " or \\'
     assert f"{place}: left out: {form}" in notes(found)
     none = "no output is converted; see measurement of outputs"
     assert f"{place}: left out: {none}" in notes(imported(metric))

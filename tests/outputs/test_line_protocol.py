@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from holdfast.config.values.scalars import is_measurement
 from holdfast.outputs.line_protocol import has_field, lines
 from holdfast.tags.scale import RegisterScale
 from support.line_protocol import parsed
@@ -95,9 +96,7 @@ def test_equal_offsets_with_other_digits_make_integers_or_floats() -> None:
     assert lines(readings, "m", {}).decode() == f"m,device=pump n=7i,w=7.0 {AT}\n"
 
 
-NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0\n\r"), min_size=1).filter(
-    lambda text: not text.endswith("\\")
-)
+NAMES = st.text(st.characters(codec="utf-8")).filter(is_measurement)
 
 
 @given(NAMES, NAMES, st.text(st.characters(codec="utf-8")), st.floats(allow_nan=False))

@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 MIN_INTEGER, MAX_INTEGER = -(2**63), 2**63 - 1
 """Integers of the protocol have 64 bits. Others become floats."""
 
-_NAME = str.maketrans({",": r"\,", " ": r"\ ", "\n": r"\n", "\r": r"\r"})
-_KEY = str.maketrans({",": r"\,", " ": r"\ ", "=": r"\=", "\n": r"\n", "\r": r"\r"})
+# The configuration refuses names that nothing here can escape.
+_NAME = str.maketrans({",": r"\,", " ": r"\ "})
+_KEY = str.maketrans({",": r"\,", " ": r"\ ", "=": r"\="})
 _TEXT = str.maketrans({'"': r"\"", "\\": r"\\", "\n": r"\\n", "\r": r"\\r", "\f": r"\\f"})
 """Texts come from devices. VictoriaMetrics ends a line at each newline, also within quotes: the
 values of the line would be lost, and the rest of the text could be a line of another device.
@@ -53,9 +54,9 @@ def lines(readings: Iterable[Reading], measurement: str, tags: Mapping[str, str]
         shown = plain(tag, _as_float(value) if is_float else value)
         fields += [f"{key.translate(_KEY)}={written}" for key, written in _fields(tag.name, shown)]
     name = measurement.translate(_NAME)
-    more = "".join(f",{key.translate(_KEY)}={_tag(value)}" for key, value in tags.items())
+    more = "".join(f",{key.translate(_KEY)}={value.translate(_KEY)}" for key, value in tags.items())
     return "".join(
-        f"{name},device={_tag(device)}{more} {','.join(fields)} {at}\n"
+        f"{name},device={device.translate(_KEY)}{more} {','.join(fields)} {at}\n"
         for (device, at), fields in points.items()
         if fields
     ).encode()
@@ -73,12 +74,6 @@ def _as_float(value: Any) -> Any:
     if isinstance(value, list):
         return [_as_float(item) for item in value]
     return float(value) if type(value) is int else value
-
-
-def _tag(value: str) -> str:
-    """A tag value; a backslash at its end would escape what follows."""
-    written = value.translate(_KEY)
-    return f"{written} " if written.endswith("\\") else written
 
 
 def _fields(name: str, value: Any) -> Iterable[tuple[str, str]]:

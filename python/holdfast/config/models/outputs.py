@@ -18,6 +18,7 @@ from holdfast.config.values.scalars import (
     MqttVersion,
     Name,
     NotNull,
+    PointTag,
     SparkplugId,
     SubjectPrefix,
     TopicName,
@@ -83,7 +84,7 @@ class InfluxConfig(OutputConfig):
     """A file that contains the password of the user."""
     measurement: Measurement = MEASUREMENT
     """The measurement of all points; each device is a tag, each tag of it a field."""
-    tags: dict[Name, Annotated[str, Field(min_length=1)]] = Field(default={})
+    tags: dict[Name, PointTag] = Field(default={})
     """More tags of all points, such as the site."""
     gzip: bool = True
     """Whether requests are compressed."""

@@ -71,9 +71,15 @@ MIN_TIME = 0.001
 NOT_ON_A_LINE = f"; 0 is the broadcast, {MAX_SERIAL_UNIT + 1} to {MAX_UNIT} are reserved"
 MAX_SPARKPLUG_ID = 255
 NAME_FORM = "1 to 64 letters, digits, '_', '.' and '-'"
-MEASUREMENT_FORM = "text that neither begins with # nor ends in a backslash"
+_POINT_FORM = (
+    "without control characters, and without a backslash at its end or before a blank, comma, =, "
+    '" or \\'
+)
+POINT_TAG_FORM = f"text {_POINT_FORM}"
+MEASUREMENT_FORM = f"text that does not begin with #, {_POINT_FORM}"
 _NAME = r"[A-Za-z0-9_.-]{1,64}"
-_MEASUREMENT = r"(?!#)[\s\S]*[^\\]"
+_POINT_TAG = r'([^\\\x00-\x1f]|\\[^ ,="\\\x00-\x1f])+'
+_MEASUREMENT = f"(?!#){_POINT_TAG}"
 _STATUS_NAME = "[ -~]{0,16}"
 _BYTE = r"([01]?[0-9]?[0-9]|2[0-4][0-9]|25[0-5])"
 _HIGH_BYTE = r"(12[89]|1[3-9][0-9]|2[0-4][0-9]|25[0-5])"
@@ -254,17 +260,27 @@ def _sparkplug_id(value: object) -> str:
 
 
 def is_measurement(text: str) -> bool:
-    """Whether line protocol can have the measurement.
-
-    A line that begins with # is a comment, and a backslash at the end would escape what follows.
-    Nothing escapes either.
-    """
+    """Whether line protocol can have the measurement: a line that begins with # is a comment."""
     return re.fullmatch(_MEASUREMENT, text) is not None
+
+
+def is_point_tag(text: str) -> bool:
+    """Whether line protocol can have the text as the value of a tag.
+
+    Nothing escapes a backslash there, and receivers differ in what it escapes.
+    """
+    return re.fullmatch(_POINT_TAG, text) is not None
 
 
 def _measurement(text: str) -> str:
     if not is_measurement(text):
         raise ValueError(f"found {show(text)}, allowed: {MEASUREMENT_FORM}")
+    return text
+
+
+def _point_tag(text: str) -> str:
+    if not is_point_tag(text):
+        raise ValueError(f"found {show(text)}, allowed: {POINT_TAG_FORM}")
     return text
 
 
@@ -440,6 +456,11 @@ Measurement = Annotated[
     str,
     Field(min_length=1, json_schema_extra={"pattern": f"^{_MEASUREMENT}$"}),
     AfterValidator(_measurement),
+]
+PointTag = Annotated[
+    str,
+    Field(min_length=1, json_schema_extra={"pattern": f"^{_POINT_TAG}$"}),
+    AfterValidator(_point_tag),
 ]
 SparkplugId = Annotated[str, Parsed(_sparkplug_id, pattern="^[^+/#]{1,255}$")]
 PeerAddress = Annotated[str, Parsed(parse_peer)]

@@ -9,7 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from holdfast.config.values.scalars import MEASUREMENT_FORM, NAME_FORM, is_measurement, is_name
+from holdfast.config.values.scalars import (
+    MEASUREMENT_FORM,
+    NAME_FORM,
+    POINT_TAG_FORM,
+    is_measurement,
+    is_name,
+    is_point_tag,
+)
 from holdfast.importing.imported import Imported, NotImportable
 from holdfast.importing.key_reader import Section, section
 from holdfast.importing.names import free_name, unique_names
@@ -204,10 +211,12 @@ class _Import:
                 tags.left_out(key, f"a tag of an output has {NAME_FORM}")
             elif key == "device":
                 tags.left_out(key, "the tag device is the name of the device")
-            elif isinstance(value, str) and value:
-                found[key] = value
-            else:
+            elif not isinstance(value, str) or not value:
                 tags.left_out(key, "a tag without text is not written")
+            elif not is_point_tag(value):
+                tags.left_out(key, f"the value of a tag of an output is {POINT_TAG_FORM}")
+            else:
+                found[key] = value
         return found
 
     def _compare(self, output: Section, fields: list[Field]) -> None:
