@@ -100,24 +100,36 @@ def test_a_refused_block_costs_only_the_tags_that_the_device_refuses() -> None:
         searching = len(device.asked)
         assert searching <= 2 * 4 + 1
         assert str(read(device, reader)[5]) == "exception 02 (Illegal Data Address)"
-        assert all(
-            not address <= 5 < address + count for address, count in asked(device)[searching:]
-        )
-        assert len(device.asked) - searching <= 4
+        again = asked(device)[searching:]
+        assert [each for each in again if each[0] <= 5 < sum(each)] == [(5, 1)]
+        assert len(again) <= 5
 
 
-def test_a_refused_tag_is_tried_again_after_a_minute() -> None:
+def test_a_refused_tag_is_tried_again_with_the_next_reading_and_merged_after_a_minute() -> None:
     moment = 0.0
     absent = [1]
     with FakeDevice(lambda pdu: without(*absent)(pdu)) as device:
         reader = TagReader([tag("a", 0), tag("b", 1)], clock=lambda: moment)
         assert isinstance(read(device, reader)[1], ModbusException)
         absent.clear()
-        moment = RETRY_REFUSED_AFTER_S - 1
-        assert isinstance(read(device, reader)[1], ModbusException)
+        assert read(device, reader) == [7, 7]
+        assert asked(device)[-2:] == [(0, 1), (1, 1)]
         moment = RETRY_REFUSED_AFTER_S
         assert read(device, reader) == [7, 7]
         assert asked(device)[-1] == (0, 2)
+
+
+def test_refused_tags_cost_one_request_in_each_reading_until_the_device_answers() -> None:
+    absent = [2, 4, 6]
+    with FakeDevice(lambda pdu: without(*absent)(pdu)) as device:
+        reader = TagReader([tag(f"t{at}", at) for at in (0, *absent)])
+        read(device, reader)
+        for at in (2, 4, 6, 2):
+            before = len(device.asked)
+            assert read(device, reader)[0] == 7
+            assert asked(device)[before:] == [(0, 1), (at, 1)]
+        absent.clear()
+        assert read(device, reader) == [7] * 4
 
 
 def test_other_exceptions_are_not_searched_and_not_remembered() -> None:

@@ -72,9 +72,11 @@ class _Block:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Blocks that answered come first, then new ones, then those silent for longest."""
-        if not self.requested_in:
-            return 1, 0
+        """Blocks that answered come first, then new ones and those refused for longest, then those
+        silent for longest.
+        """
+        if self.refused or not self.requested_in:
+            return 1, self.requested_in
         return (0, 0) if self.answered else (2, self.requested_in)
 
 
@@ -89,7 +91,10 @@ class _Field:
 
 
 class TagReader:
-    """Reads tags, and remembers for a minute what the device refuses.
+    """Reads tags, and remembers what the device refuses.
+
+    Each reading tries again what has been refused for longest, and goes on to the next as long as
+    the device answers: refusals cost one request in each reading.
 
     Gaps of up to `max_gap` registers or bits between tags are read with them.
     """
@@ -145,15 +150,20 @@ class TagReader:
         self._number += 1
         self._readings = {}
         silent = 0
+        retries_refused = True
         ended: ModbusError | None = None
         blocks: list[_Block] = []
         for block in sorted(self._blocks, key=lambda each: each.rank):
-            if failure := block.refused or ended:
+            was_refused = block.refused
+            failure = was_refused or ended
+            if failure is not None and (ended is not None or not retries_refused):
                 self._fail(block, failure)
                 blocks.append(block)
                 continue
             replacements, error = yield from self._request(block)
             blocks += replacements
+            if was_refused is not None and block.refused is not None:
+                retries_refused = False
             if error is None:
                 silent = 0
                 continue
@@ -196,7 +206,7 @@ class TagReader:
 
     def _request(self, block: _Block) -> Steps[tuple[list[_Block], ModbusError | None]]:
         """Reads a block. Returns the blocks that replace it, and the error of a silent device."""
-        block.requested_in = self._number
+        block.requested_in, block.refused = self._number, None
         try:
             data = yield block
         except ModbusError as error:
