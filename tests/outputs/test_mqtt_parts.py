@@ -121,6 +121,51 @@ def test_the_status_topic_begins_as_the_others(template: str | None, status: str
     assert TopicNames(template, None, whole_device=False).status == status
 
 
+@pytest.mark.parametrize(
+    ("template", "whole_device", "topic", "device"),
+    [
+        ("a/{device}/{tag}", False, "a/pump/n", "pump"),
+        ("a/{device}/{tag}", False, "a/pump/n/set", "pump"),
+        ("a/{device}/{tag}", False, "a/pump/n/set/reply", "pump"),
+        ("a/{device}/{tag}", False, "a/pump/n/x", None),
+        ("a/{device}/{tag}", False, "b/pump/n", None),
+        ("{tag}/a/{device}/b", False, "n/a/pump/b", "pump"),
+        ("a/{device}", True, "a/pump", "pump"),
+        ("a/{device}", True, "a/pump/n/set", "pump"),
+        ("a/{device}", True, "a/pump/n", None),
+    ],
+)
+def test_the_device_of_a_topic(
+    template: str, whole_device: bool, topic: str, device: str | None
+) -> None:
+    assert TopicNames(template, None, whole_device=whole_device).device_of(topic) == device
+
+
+@pytest.mark.parametrize(
+    ("devices", "given", "topic"),
+    [
+        (("holdfast", "value"), "topic: 'plant/{device}/{tag}/value'", "value"),
+        (("holdfast", "set"), "payload: device, writes: true", "set"),
+    ],
+)
+def test_the_availability_of_a_device_has_a_topic_of_its_own(
+    tmp_path: Path, devices: tuple[str, ...], given: str, topic: str
+) -> None:
+    polled = ", ".join(
+        f"{name}: {{url: 'tcp://127.0.0.1', interval: 1, tags: {{status: {{area: coils, "
+        f"address: {at}}}}}}}"
+        for at, name in enumerate(devices)
+    )
+    text = f"devices: {{{polled}}}\noutputs: {{home: {{type: mqtt, url: 'mqtt://h', {given}}}}}\n"
+    [found] = Folder(tmp_path).problems(text)
+    assert found.endswith(
+        "outputs.home.status: found 'plant/holdfast/status', and below it "
+        f"'plant/holdfast/status/{topic}', which is a topic of the device holdfast, allowed: "
+        "another topic"
+    )
+    assert Folder(tmp_path).config(text.replace("holdfast:", "pump:"))
+
+
 def test_with_an_object_for_a_device_commands_have_the_tag_in_their_topic() -> None:
     names = TopicNames("a/{device}/b", None, whole_device=True)
     assert names.of_device("pump") == "a/pump/b"

@@ -83,12 +83,16 @@ def _check_topics(scope: Scope, path: KeyPath, output: MqttOutputConfig) -> None
     if template is not None and not whole and TAG not in template:
         message = f"found {show(template)}, allowed: with {TAG} (optional with payload: device)"
         scope.report.add((*path, "topic"), message)
-    names = output.topics
-    for device in scope.names("devices"):
-        if names.is_of_device(names.status, device):
-            message = f"found {show(names.status)}, which is a topic of the device {device}"
-            message += ", allowed: another topic"
-            scope.report.add_key((*path, "status"), message)
+    names, devices = output.topics, scope.names("devices")
+    status = names.status
+    for topic in (status, *map(names.of_availability, devices)):
+        owner = names.device_of(topic)
+        if owner in devices:
+            found = (
+                show(status) if topic == status else f"{show(status)}, and below it {show(topic)}"
+            )
+            message = f"found {found}, which is a topic of the device {owner}"
+            scope.report.add_key((*path, "status"), f"{message}, allowed: another topic")
             break
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import cached_property
 
 from holdfast.config.values.topics import DEVICE, TAG
 
@@ -46,7 +47,20 @@ class TopicNames:
         """The topic that is online while a device answers."""
         return f"{self.status}/{device}"
 
-    def is_of_device(self, topic: str, device: str) -> bool:
-        """Whether a topic can be one of the values of a device."""
-        own = re.escape(self.of_device(device)).replace(re.escape(TAG), "[^/]+")
-        return re.fullmatch(own, topic) is not None
+    def device_of(self, topic: str) -> str | None:
+        """The device for whose values, commands or replies the topic can be."""
+        found = (pattern.fullmatch(topic) for pattern in self._forms)
+        return next((each[1] for each in found if each is not None), None)
+
+    @cached_property
+    def _forms(self) -> list[re.Pattern[str]]:
+        """The forms of all topics of devices."""
+        commands = self.of_commands(DEVICE, TAG)
+        return [
+            re.compile(
+                re.escape(form)
+                .replace(re.escape(DEVICE), "([^/]+)")
+                .replace(re.escape(TAG), "[^/]+")
+            )
+            for form in (self.template, commands, f"{commands}/{REPLY}")
+        ]
