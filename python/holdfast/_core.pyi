@@ -542,17 +542,18 @@ class Batch:
 
 @final
 class Rule:
-    """What the peers of some networks may do.
+    """What the peers of some networks may do, or the client of a serial line.
 
     `units` maps unit ids, 0 to 255, to memories, routes and passages. `sources` are networks or
-    addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. Set
-    `functions`, the allowed function codes, or `deny`, the codes that are not allowed, but not
-    both. `roles`, only with TLS, are the allowed roles of the peer's certificate: "" is a
-    certificate without a role, `None` is any role. `narrowed` are units with rights of their own:
-    access, functions, denied functions, and the ranges that they may read and write, each an area,
-    its first address and a count; `None` is everything. `exception_status` is where units have the
-    eight bits that function 7 reads: area and address. `fifo` are the addresses where units have
-    the queues that function 24 reads. Other units do not have these functions.
+    addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. A network
+    requires them, a serial line has none. Set `functions`, the allowed function codes, or `deny`,
+    the codes that are not allowed, but not both. `roles`, only with TLS, are the allowed roles of
+    the peer's certificate: "" is a certificate without a role, `None` is any role. `narrowed` are
+    units with rights of their own: access, functions, denied functions, and the ranges that they
+    may read and write, each an area, its first address and a count; `None` is everything.
+    `exception_status` is where units have the eight bits that function 7 reads: area and address.
+    `fifo` are the addresses where units have the queues that function 24 reads. Other units do not
+    have these functions.
 
     Raises `ValueError` for an invalid source or access.
     """
@@ -561,8 +562,8 @@ class Rule:
         cls,
         units: Mapping[int, Memory | Route | Passage],
         *,
-        sources: Sequence[str],
         access: Access,
+        sources: Sequence[str] | None = None,
         functions: Sequence[int] | None = None,
         deny: Sequence[int] | None = None,
         roles: Sequence[str] | None = None,
@@ -570,6 +571,17 @@ class Rule:
         exception_status: Mapping[int, tuple[BitArea, int]] | None = None,
         fifo: Mapping[int, Sequence[int]] | None = None,
     ) -> Rule: ...
+    @property
+    def sources(self) -> list[str] | None:
+        """The networks of the peers; `None` if none were given, as on a serial line."""
+
+    @property
+    def roles(self) -> list[str] | None:
+        """The roles of certificates; `None` is any role."""
+
+    @property
+    def unit_ids(self) -> set[int]:
+        """The unit ids of `units`."""
 
 @final
 class RawRule:

@@ -67,6 +67,14 @@ def test_a_serial_line(mode: str, tmp_path: Path, memory: holdfast.Memory) -> No
                 assert server.address
 
 
+def test_a_rule_of_a_serial_line_serves_it(tmp_path: Path, memory: holdfast.Memory) -> None:
+    rule = holdfast.Rule({1: memory}, access="read-write")
+    with Cable(tmp_path) as cable:
+        one, other = (f"rtu://{device}?baud=115200&parity=none" for device in cable.devices)
+        with holdfast.Server(rules=[rule], bind=one):
+            exchange(other, memory)
+
+
 @pytest.mark.parametrize(
     ("bind", "options", "says"),
     [
@@ -80,6 +88,7 @@ def test_a_serial_line(mode: str, tmp_path: Path, memory: holdfast.Memory) -> No
         ("tcp://127.0.0.1:0", {"frame_timeout": 1}, "frame_timeout has no effect with tcp"),
         ("rtu:///dev/x", {"listen_only": True}, "listen_only has no effect with rtu"),
         ("ascii:///dev/x", {"sources": ["127.0.0.0/8"]}, "sources has no effect with ascii"),
+        ("rtu:///dev/x", {"sources": ["127.0.0.0/8", "::1/128"]}, "sources has no effect with rtu"),
         ("rtu:///dev/x?retries=1", {}, "which has options of clients"),
         ("rtu:///dev/x?speed=1", {}, "unknown option 'speed'"),
         ("rtu://", {}, "has no device"),
@@ -100,8 +109,41 @@ def test_a_server_on_a_serial_line_has_no_other_unit_than_1_to_247(
         holdfast.Server({1: memory, unit: memory}, bind="rtu:///dev/x", access="read-only")
 
 
+@pytest.mark.parametrize("unit", [0, 248, 255])
+def test_a_rule_of_a_serial_line_has_no_other_unit_than_1_to_247(
+    memory: holdfast.Memory, unit: int
+) -> None:
+    rule = holdfast.Rule({1: memory, unit: memory}, access="read-only")
+    with pytest.raises(ValueError, match=f"unit id {unit}, allowed on a serial line: 1 to 247"):
+        holdfast.Server(rules=[rule], bind="ascii:///dev/x")
+
+
+@pytest.mark.parametrize("sources", [[], ["127.0.0.0/8"]])
+def test_a_rule_of_a_serial_line_has_no_sources(
+    memory: holdfast.Memory, sources: list[str]
+) -> None:
+    rule = holdfast.Rule({1: memory}, sources=sources, access="read-only")
+    with pytest.raises(ValueError, match="sources has no effect with rtu: omit it"):
+        holdfast.Server(rules=[rule], bind="rtu:///dev/x")
+
+
+@pytest.mark.parametrize("scheme", ["tcp", "udp", "rtu+tcp", "rtu+udp", "ascii+tcp"])
+def test_a_rule_of_a_network_requires_sources(memory: holdfast.Memory, scheme: str) -> None:
+    rule = holdfast.Rule({1: memory}, access="read-only")
+    with pytest.raises(ValueError, match=f"a rule requires sources with {re.escape(scheme)}, as"):
+        holdfast.Server(rules=[rule], bind=f"{scheme}://127.0.0.1:0")
+
+
+@pytest.mark.parametrize("bind", ["tcp://127.0.0.1:0", "udp://127.0.0.1:0", "rtu:///dev/x"])
+def test_only_tls_has_roles(memory: holdfast.Memory, bind: str) -> None:
+    sources = None if bind.startswith("rtu:") else ["127.0.0.1"]
+    rule = holdfast.Rule({1: memory}, sources=sources, access="read-write", roles=["operator"])
+    with pytest.raises(ValueError, match="roles has no effect with"):
+        holdfast.Server(rules=[rule], bind=bind)
+
+
 def test_a_serial_line_has_one_rule(memory: holdfast.Memory) -> None:
-    rule = holdfast.Rule({1: memory}, sources=[], access="read-only")
+    rule = holdfast.Rule({1: memory}, access="read-only")
     with pytest.raises(ValueError, match="found 2 rules, a serial line has exactly one"):
         holdfast.Server(rules=[rule, rule], bind="rtu:///dev/x")
 

@@ -1,6 +1,6 @@
 //! `Rule`, `RawRule` and `Listener`: settings of listeners.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -45,33 +45,35 @@ type Limits = (Option<Vec<Range>>, Option<Vec<Range>>);
 /// The rights of a unit: access, functions, denied functions, ranges.
 type Narrow = (String, Option<Vec<i128>>, Option<Vec<i128>>, Limits);
 
-/// What the peers of some networks may do.
+/// What the peers of some networks may do, or the client of a serial line.
 ///
 /// `units` maps unit ids, 0 to 255, to memories, routes and passages. `sources` are networks or
-/// addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. Set
-/// `functions`, the allowed function codes, or `deny`, the codes that are not allowed, but not
-/// both. `roles`, only with TLS, are the allowed roles of the peer's certificate: "" is a
-/// certificate without a role, `None` is any role. `narrowed` are units with rights of their own:
-/// access, functions, denied functions, and the ranges that they may read and write, each an area,
-/// its first address and a count; `None` is everything. `exception_status` is where units have the
-/// eight bits that function 7 reads: area and address. `fifo` are the addresses where units have
-/// the queues that function 24 reads. Other units do not have these functions.
+/// addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. A network
+/// requires them, a serial line has none. Set `functions`, the allowed function codes, or `deny`,
+/// the codes that are not allowed, but not both. `roles`, only with TLS, are the allowed roles of
+/// the peer's certificate: "" is a certificate without a role, `None` is any role. `narrowed` are
+/// units with rights of their own: access, functions, denied functions, and the ranges that they
+/// may read and write, each an area, its first address and a count; `None` is everything.
+/// `exception_status` is where units have the eight bits that function 7 reads: area and address.
+/// `fifo` are the addresses where units have the queues that function 24 reads. Other units do not
+/// have these functions.
 ///
 /// Raises `ValueError` for an invalid source or access.
 #[pyclass(frozen, module = "holdfast")]
 pub struct Rule {
     core: CoreRule,
+    has_sources: bool,
 }
 
 #[pymethods]
 impl Rule {
     #[new]
-    #[pyo3(signature = (units, *, sources, access, functions=None, deny=None, roles=None, narrowed=None, exception_status=None, fifo=None))]
+    #[pyo3(signature = (units, *, access, sources=None, functions=None, deny=None, roles=None, narrowed=None, exception_status=None, fifo=None))]
     #[expect(clippy::too_many_arguments, reason = "they are keywords of Python")]
     fn new(
         units: &Bound<'_, PyMapping>,
-        sources: Vec<String>,
         access: &str,
+        sources: Option<Vec<String>>,
         functions: Option<Vec<i128>>,
         deny: Option<Vec<i128>>,
         roles: Option<Vec<String>>,
@@ -123,18 +125,38 @@ impl Rule {
                 memories.push((unit, Arc::clone(&memory.core)));
             }
         }
-        let (sources, units) = (networks(&sources)?, memories);
         Ok(Rule {
+            has_sources: sources.is_some(),
             core: CoreRule {
-                sources,
+                sources: networks(&sources.unwrap_or_default())?,
                 roles,
-                units,
+                units: memories,
                 elsewhere,
                 access,
                 functions,
                 narrowed: narrowed.into_iter().collect(),
             },
         })
+    }
+
+    /// The networks of the peers; `None` if none were given, as on a serial line.
+    #[getter]
+    fn sources(&self) -> Option<Vec<String>> {
+        let sources = self.core.sources.iter().map(ToString::to_string);
+        self.has_sources.then(|| sources.collect())
+    }
+
+    /// The roles of certificates; `None` is any role.
+    #[getter]
+    fn roles(&self) -> Option<Vec<String>> {
+        self.core.roles.clone()
+    }
+
+    /// The unit ids of `units`.
+    #[getter]
+    fn unit_ids(&self) -> BTreeSet<u8> {
+        let memories = self.core.units.iter().map(|(unit, _)| *unit);
+        memories.chain(self.core.elsewhere.iter().map(|(unit, _)| *unit)).collect()
     }
 }
 

@@ -67,6 +67,7 @@ _running: set[_core.Engine] = set()
 SERVED = (_core.Memory, _core.Route, _core.Passage)
 UNITS = "{1: memory}"
 CODES = "[3, 16]"
+NETWORKS = "['10.0.0.0/24', 'fd00::/64']"
 
 MAX_WORKERS = 64
 SOURCES = tuple(map(str, LOOPBACK))
@@ -75,10 +76,10 @@ SOURCES = tuple(map(str, LOOPBACK))
 class Server:
     """Serves memories over Modbus, from `start` (or `with`) to `stop`.
 
-    `units` maps unit ids, 0 to 255 (1 to 247 on a serial line), to memories. Peers from `sources`
-    have `access` to them, limited by `functions` or `deny`, lists of function codes. Alternatively,
-    set `rules`: for each unit id, the first rule that matches the peer and has the unit id applies.
-    A peer without a rule is disconnected at once.
+    `units` maps unit ids, 0 to 255 (1 to 247 on a serial line), to memories. Peers from `sources`,
+    by default this machine, have `access` to them, limited by `functions` or `deny`, lists of
+    function codes. Alternatively, set `rules`: for each unit id, the first rule that matches the
+    peer and has the unit id applies. A peer without a rule is disconnected at once.
     `bind` is `address:port` for Modbus TCP, or a URL with the schemes of clients: `tcp`, `tls`,
     `udp`, `rtu+tcp`, `rtu+udp` and `ascii+tcp` with an IP address and a port, `rtu` and `ascii`
     with a serial line, as in `rtu:///dev/ttyUSB0?baud=19200&parity=even`. Port 0 lets the system
@@ -100,7 +101,7 @@ class Server:
         *,
         bind: str,
         access: Access | None = None,
-        sources: Sequence[str] = SOURCES,
+        sources: Sequence[str] | None = None,
         functions: Collection[int] | None = None,
         deny: Collection[int] | None = None,
         rules: Sequence[Rule] | None = None,
@@ -112,17 +113,16 @@ class Server:
             if units is None or access is None:
                 raise TypeError("a server requires units and access, or rules")
             _check_units(units)
+            if sources is None and _split(bind)[0] not in SERIAL:
+                sources = SOURCES
             rule = _core.Rule(
                 units,
-                sources=_listed("sources", sources, "['10.0.0.0/24', 'fd00::/64']"),
+                sources=None if sources is None else _listed("sources", sources, NETWORKS),
                 access=access,
                 functions=None if functions is None else _listed("functions", functions, CODES),
                 deny=_listed("deny", deny, CODES) if deny else None,
             )
             rules = [rule]
-            scheme, _ = _split(bind)
-            if scheme in SERIAL:
-                _check_line(scheme, units, sources)
         elif units is not None or access is not None:
             raise TypeError("a server requires units and access, or rules, not both")
         if not 1 <= index(workers) <= MAX_WORKERS:
@@ -215,6 +215,8 @@ def _listener(bind: str, rules: Sequence[Rule], options: ServerOptions) -> _core
     """Returns the listener for `bind`. Raises `ValueError` for what it can't be or have."""
     scheme, address = _split(bind)
     _check(scheme, options)
+    for rule in rules:
+        _check_rule(scheme, rule)
     if scheme in SERIAL:
         return _serial(bind, rules, options)
     if scheme in _DATAGRAMS:
@@ -263,11 +265,19 @@ def _other_type(name: str, value: object) -> str | None:
     return None if as_integer(value) is not None else f"an integer{', None' * (default is None)}"
 
 
-def _check_line(scheme: str, units: Collection[int], sources: Sequence[str]) -> None:
-    """Raises `ValueError` for sources and unit ids that a serial line does not have."""
-    if tuple(sources) != SOURCES:
+def _check_rule(scheme: str, rule: Rule) -> None:
+    """Raises `ValueError` for what a rule has and this scheme does not, or the other way round."""
+    if not isinstance(rule, _core.Rule):
+        raise TypeError(f"found the rule {rule!r}, allowed: holdfast.Rule(…)")
+    if scheme != "tls" and rule.roles is not None:
+        raise ValueError(f"roles has no effect with {scheme}: omit it")
+    if scheme not in SERIAL:
+        if rule.sources is None:
+            raise ValueError(f"a rule requires sources with {scheme}, as in {NETWORKS}")
+        return
+    if rule.sources is not None:
         raise ValueError(f"sources has no effect with {scheme}: omit it")
-    for unit in units:
+    for unit in sorted(rule.unit_ids):
         if not 1 <= unit <= MAX_SERIAL_UNIT:
             allowed = f"allowed on a serial line: 1 to {MAX_SERIAL_UNIT}"
             raise ValueError(f"found the unit id {unit}, {allowed}")

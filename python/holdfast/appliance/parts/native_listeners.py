@@ -198,7 +198,6 @@ def _serial_rule(
     units = together(rules)
     return _core.Rule(
         _targets(units, memories, links),
-        sources=[],
         access=rules[0].access,  # Not used: `narrowed` has all units.
         narrowed={unit: _narrowed(rights) for unit, rights in units.items()},
         exception_status=_exception_status(units),
