@@ -114,6 +114,9 @@ def of_iec(text: str) -> Place:
     kind, address = (match[1].upper(), int(match[2])) if match else ("", 0)
     if kind in IEC_READINGS:
         readings = IEC_READINGS[kind].format(address, 2 * address)
+        one, _, other = readings.partition(" or ")
+        if other.startswith(f"{one},"):  # Words and pairs of words both begin with 0.
+            raise click.UsageError(f"{text!r} is not an item: type {one}.")
         raise click.UsageError(f"{text!r} is not clear: type {readings}.")
     if match is None or match[3] or kind not in IEC_AREAS or address > LAST_ADDRESS:
         raise click.UsageError(
