@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from holdfast.runtime.lazy_names import imported_on_use
 
 if TYPE_CHECKING:
-    from holdfast import raw_ingest, values
+    from holdfast import polling, raw_ingest, server, values
     from holdfast._core import Memory, OutOfRange, Rule, ServerTls, __version__
     from holdfast.client import Client, SyncClient
     from holdfast.config.tag_files.read import load_tags
@@ -52,7 +52,9 @@ else:
             "Server": "holdfast.server",
             "WriteCallback": "holdfast.server.write_callback",
             "load_tags": "holdfast.config.tag_files.read",
+            "polling": "holdfast.polling",
             "raw_ingest": "holdfast.raw_ingest",
+            "server": "holdfast.server",
             "values": "holdfast.values",
         },
     )
@@ -80,7 +82,9 @@ __all__ = [
     "WriteCallback",
     "__version__",
     "load_tags",
+    "polling",
     "raw_ingest",
+    "server",
     "values",
 ]
 

@@ -206,6 +206,15 @@ def test_the_library_imports_what_is_used() -> None:
     assert "asyncio" in heavy_after(program.format("holdfast.Client"))[1]
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["polling.WriteFailed", "polling.faults.WITHDRAWN", "raw_ingest.send", "server.Identity"],
+)
+def test_the_library_imports_its_modules_by_their_names(name: str) -> None:
+    program = f"import holdfast; holdfast.{name}"
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
 def test_the_library_requires_msgspec_only() -> None:
     program = """
 import sys

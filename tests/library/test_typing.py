@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, SupportsIndex, assert_type, get_args
 import pytest
 
 import holdfast
-from holdfast import _core, raw_ingest, values
+from holdfast import _core, polling, raw_ingest, server, values
 from holdfast.types import BoolType, FloatType, FourByteOrder, IntegerType
 from holdfast.values import register_count
 from holdfast.values.orders import FOUR
@@ -110,7 +110,7 @@ def test_the_named_types_and_orders_are_all_there_are() -> None:
 
 def public() -> Iterator[tuple[str, Any]]:
     """Every public name of the library, and every public member of its classes."""
-    for module in (holdfast, values, raw_ingest):
+    for module in (holdfast, polling, raw_ingest, server, values):
         yield module.__name__, module
         for name in module.__all__:
             found = getattr(module, name)
