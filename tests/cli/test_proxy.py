@@ -124,6 +124,14 @@ def test_a_serial_line_has_broadcasts(proxy: Proxy, tmp_path: Path) -> None:
     assert [(asked.unit, asked.pdu) for asked in device.requests] == [(0, WRITE), (1, READ)]
 
 
+def test_unit_may_be_a_reserved_id_of_a_serial_line(proxy: Proxy, tmp_path: Path) -> None:
+    with Serial(RTU, tmp_path / "line", then=lambda asked: asked.answer(FIVE)) as device:
+        running = proxy(device.url, "--unit", "248")
+        with wire.Connection(running.wait_until_it_serves()) as client:
+            assert client.ask(READ) == FIVE
+    assert [(asked.unit, asked.pdu) for asked in device.requests] == [(248, READ)]
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_it_with_exit_code_0(
     device: Stream, proxy: Proxy, number: signal.Signals
@@ -160,8 +168,8 @@ def test_a_port_that_is_taken_is_one_line_and_exit_code_1() -> None:
          "'10.0.0.1/8', which has host bits set: the network is 10.0.0.0/8."),
         ([NOBODY, "--unit", "256"], "Error: Invalid value for '--unit': found 256, allowed: 0 to "
          "255."),
-        (["rtu:///dev/none", "--unit", "248"], "Error: --unit on a serial line is 1 to 247, not "
-         "248."),
+        (["rtu:///dev/none", "--unit", "0"], "Error: Unit id 0 is the broadcast on a serial line: "
+         "nobody answers it."),
         ([NOBODY, "--timeout", "0"], "Error: Invalid value for '--timeout': '0' is not a time, as "
          "in 500ms, 2s or 2 (seconds): from 0.001, up to 31622400 s."),
         ([NOBODY, "--timeout", "nan"], "Error: Invalid value for '--timeout': 'nan' is not a time, "

@@ -44,7 +44,7 @@ URLS = (
 RECEIVER = "raw://10.0.2.9:9000 or raw+tls://10.0.2.9:9000?ca=ca.pem"
 READS = "  reads: a list"
 WORD = "an integer from 0 to 65535"
-SERIAL = "a unit id from 1 to 247; 0 is the broadcast, 248 to 255 are reserved"
+SERIAL = "a unit id from 1 to 255; 0 is the broadcast"
 OWN = "allowed: addresses without overlap"
 
 
@@ -358,11 +358,20 @@ def test_every_overlap_in_a_long_range_is_told(folder: Folder) -> None:
     assert found == [f"devices.a.reads[{index}].into" for index in (1, 2, 3)]
 
 
-@pytest.mark.parametrize("unit", [0, 248, 255])
 @pytest.mark.parametrize("scheme", ["rtu", "ascii"])
-def test_a_unit_of_a_serial_line_is_1_to_247(folder: Folder, unit: int, scheme: str) -> None:
+def test_a_device_of_a_serial_line_is_not_the_broadcast(folder: Folder, scheme: str) -> None:
+    text = changed("tcp://10.0.0.9", f"{scheme}:///dev/ttyX").replace("unit: 1", "unit: 0")
+    assert told(folder, text) == [f"6: unit: found 0, allowed on a serial line: {SERIAL}"]
+
+
+@pytest.mark.parametrize("unit", [248, 255])
+@pytest.mark.parametrize("scheme", ["rtu", "ascii"])
+def test_a_device_of_a_serial_line_may_have_a_reserved_unit_id(
+    folder: Folder, unit: int, scheme: str
+) -> None:
+    """Some do: 248 is the general address of common energy meters."""
     text = changed("tcp://10.0.0.9", f"{scheme}:///dev/ttyX").replace("unit: 1", f"unit: {unit}")
-    assert told(folder, text) == [f"6: unit: found {unit}, allowed on a serial line: {SERIAL}"]
+    assert folder.config(text).devices["meter"].unit == unit
 
 
 def test_a_serial_line_is_driven_in_one_way(folder: Folder) -> None:

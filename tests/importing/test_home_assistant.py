@@ -573,9 +573,10 @@ def test_a_serial_line_and_pauses_are_in_the_url(imported: Callable[..., Importe
     hub = (
         "- {name: line, type: serial, method: rtu, port: /dev/ttyUSB0, baudrate: 9600, "
         "bytesize: 8, parity: N, stopbits: 1, delay: 2, message_wait_milliseconds: 30, "
-        "timeout: 5, sensors: {name: a, address: 1}}\n"
+        "timeout: 5, sensors: {name: a, address: 1, slave: 248}}\n"
     )
     device = imported("", hub).data["devices"]["line"]
+    assert device["unit"] == 248
     line = "rtu:///dev/ttyUSB0?baud=9600&parity=none&stop_bits=1"
     assert device["url"] == f"{line}&pause=0.03&pause_after_connect=2"
     assert device["timeout"] == 5
@@ -1110,7 +1111,7 @@ def test_what_a_line_can_not_have_is_refused(imported: Callable[..., Imported]) 
         imported("", hub)
     assert [line.partition(": ")[2] for line in refusals(raised.value)] == [
         "[0].timeout: found -5, allowed: 0.001 to 31622400 seconds",
-        "[0].sensors.slave: found 0, allowed: a unit id from 1 to 247",
+        "[0].sensors.slave: found 0, allowed: a unit id from 1 to 255",
     ]
 
 

@@ -694,11 +694,17 @@ def test_fields_that_the_source_refuses(
     assert problem in problems(imported, field_of(settings))
 
 
+def test_a_reserved_unit_id_of_a_serial_line_is_kept(
+    imported: Callable[[str], Imported],
+) -> None:
+    found = imported(changed("slave_id = 3", "slave_id = 248", SERIAL))
+    assert device(found)["unit"] == 248
+
+
 def test_serial_lines_have_no_broadcasts(imported: Callable[[str], Imported]) -> None:
-    for number in ("  slave_id = 0\n", "  slave_id = 248\n", ""):
+    for number in ("  slave_id = 0\n", ""):
         found = problems(imported, changed("  slave_id = 3\n", number, SERIAL))
-        wanted = number[13:-1] or "0"
-        message = f"found slave_id {wanted}, allowed on a serial line: 1 to 247"
+        message = "found slave_id 0, allowed on a serial line: 1 to 255"
         assert found == [f"1: inputs.modbus[0]: {message}"]
     assert problems(imported, changed("data_bits = 8", "data_bits = 7", SERIAL)) == [
         "7: inputs.modbus[0].data_bits: found 7, allowed: 8 with transmission_mode RTU"

@@ -290,7 +290,7 @@ def devices(draw: st.DrawFn, memories: dict[str, Any]) -> dict[str, Any]:
         read = {"area": "input_registers", "address": 65535, "count": 1}
         made[name] = {
             "url": draw(PLACES),
-            "unit": draw(st.integers(1, 247)),
+            "unit": draw(st.integers(1, 255)),
             "interval": draw(st.floats(0.01, 31_622_400)),
             "reads": [read, *draw(st.lists(st.just(read), max_size=2))],
             **draw(HOLES),

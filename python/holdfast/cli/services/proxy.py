@@ -12,8 +12,10 @@ from holdfast.cli.options.device import unit_option, usable
 from holdfast.cli.options.duration import Duration, time_option, timeout_option
 from holdfast.cli.options.log_lines import log_format_option
 from holdfast.cli.options.option import choice, option, parsed_by
+from holdfast.cli.options.units import refuse_broadcast
 from holdfast.cli.options.url import checked_url
 from holdfast.cli.services.run import serve
+from holdfast.client.base import is_broadcast
 from holdfast.client.endpoint import endpoint
 from holdfast.client.serial_settings import SerialTarget
 from holdfast.client.url import IN_FLIGHT, parse
@@ -99,7 +101,8 @@ def proxy(
     tcp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, rtu+tcp://host:4001 and others.
 
     Unit ids pass through: 0 to 255 to a network address, 1 to 247 to a serial line, where requests
-    to 0 are broadcast and have no reply. With --unit, all unit ids lead to one device.
+    to 0 are broadcast and have no reply. With --unit, all unit ids lead to one device, 1 to 255 on
+    a serial line.
 
     On SIGHUP, the TLS files in DEVICE-URL are read anew. This is `holdfast run` with one listener
     and one link. A configuration file allows more listeners, rules and devices.
@@ -111,8 +114,8 @@ def proxy(
     with usable():
         endpoint(target)
     require_source(bind, sources)
-    if is_line and unit is not None and not 1 <= unit <= MAX_SERIAL_UNIT:
-        raise click.UsageError(f"--unit on a serial line is 1 to {MAX_SERIAL_UNIT}, not {unit}.")
+    if unit is not None and is_broadcast(target, unit):
+        refuse_broadcast([unit])
     for code in functions or () if access == "read-only" else ():
         if code in WRITING_CODES or code not in CODES:
             raise click.UsageError(f"--functions {code} may write: omit it, or --access read-only.")

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from holdfast.client.base import is_broadcast
 from holdfast.client.serial_settings import SerialTarget
 from holdfast.client.tolerance import STRICT, Tolerance
 from holdfast.client.url import IN_FLIGHT, parse, parse_receiver
@@ -21,9 +22,8 @@ from holdfast.config.models.listeners import (
     ModbusRtuListener,
 )
 from holdfast.config.text.messages import show
-from holdfast.config.values.scalars import NOT_ON_A_LINE
 from holdfast.net.allow_list import AllowedDevice
-from holdfast.protocol import MAX_SERIAL_UNIT
+from holdfast.protocol import MAX_UNIT
 from holdfast.types import SERIAL_FRAMES
 
 if TYPE_CHECKING:
@@ -158,9 +158,10 @@ class AddressChecks:
         plugged in again, and each user must have the line that its URL names.
         """
         with until_invalid():
-            if isinstance(user, DeviceConfig) and not 1 <= user.unit <= MAX_SERIAL_UNIT:
-                allowed = f"allowed on a serial line: a unit id from 1 to {MAX_SERIAL_UNIT}"
-                self.report.add((*path, "unit"), f"found {user.unit}, {allowed}{NOT_ON_A_LINE}")
+            if isinstance(user, DeviceConfig) and is_broadcast(target, user.unit):
+                allowed = f"allowed on a serial line: a unit id from 1 to {MAX_UNIT}"
+                message = f"found {user.unit}, {allowed}; 0 is the broadcast"
+                self.report.add((*path, "unit"), message)
         port = os.path.realpath(target.device)
         if port in self._listener_ports:
             self._refuse_used((*path, "url"), target.device, self._listener_ports[port])

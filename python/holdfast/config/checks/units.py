@@ -23,7 +23,6 @@ from holdfast.protocol import (
     FILE_FUNCTIONS,
     GET_COMM_EVENT_LOG,
     MAX_CODE,
-    MAX_SERIAL_UNIT,
     MAX_UNIT,
     READ_EXCEPTION_STATUS,
     READ_FIFO_QUEUE,
@@ -249,13 +248,7 @@ def _check_route(scope: Scope, path: KeyPath, ids: range, name: str) -> None:
         if not scope.config.devices[name].enabled:
             message = f"found {show(name)}, which is disabled, allowed: an enabled device"
             scope.report.add(where, message)
-    elif name in links:
-        target = scope.config.links[name].target
-        if ids and ids[-1] > MAX_SERIAL_UNIT and isinstance(target, SerialTarget):
-            allowed = f"a unit id from 0 to {MAX_SERIAL_UNIT}"
-            message = f"found {key}, allowed with a route to a serial line: {allowed}"
-            scope.report.add_key(path, message)
-    else:
+    elif name not in links:
         known = [*devices, *links]
         allowed = f"{listing(known)}{suggestion(name, known)}" if known else "a device or a link"
         scope.report.add(where, f"found {show(name)}, allowed: {allowed}")

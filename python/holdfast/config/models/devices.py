@@ -287,7 +287,7 @@ class DeviceConfig(Model):
     url: DeviceUrl
     """The URL of the device, or of the gateway in front of it."""
     unit: UnitId = 1
-    """The unit id, 0 to 255; on a serial line 1 to 247."""
+    """The unit id, 0 to 255; on a serial line 1 to 255."""
     writes: Literal["refuse", "pass", "local"] = "refuse"
     """Writes into what it is read into: refused, sent to it, or kept until the next poll."""
     stale: Annotated[StaleConfig | None, NotNull()] = None

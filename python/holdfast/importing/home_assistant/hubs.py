@@ -26,7 +26,7 @@ from holdfast.importing.imported import Imported, Source
 from holdfast.importing.key_reader import Secret, Section, section
 from holdfast.importing.names import MAX_LENGTH, free_name, unique_names
 from holdfast.net.addresses import joined
-from holdfast.protocol import MAX_SERIAL_UNIT, MAX_UNIT
+from holdfast.protocol import MAX_UNIT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -291,8 +291,7 @@ class _Hub:
     def _entity(self, entity: Section, platform: str, convert: Entities) -> None:
         given = entity.get("device_address")
         key = "device_address" if given is not None else "slave"
-        least, most = (1, MAX_SERIAL_UNIT) if self._is_line else (0, MAX_UNIT)
-        number = entity.integer(key, least, most, what="a unit id")
+        number = entity.integer(key, int(self._is_line), MAX_UNIT, what="a unit id")
         if entity.get(key) is None:
             message = f"no slave: unit {UNIT}, as in newer versions; older ones asked 0"
             self.desk.check(entity.path, message)

@@ -15,7 +15,7 @@ from holdfast.importing.telegraf.durations import interval, seconds
 from holdfast.importing.telegraf.fields import STYLES, Field, Fields
 from holdfast.importing.telegraf.reasons import FILTERS, LOGGED
 from holdfast.net.addresses import joined
-from holdfast.protocol import MAX_SERIAL_UNIT, READ_BITS, READ_REGISTERS
+from holdfast.protocol import MAX_UNIT, READ_BITS, READ_REGISTERS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -101,8 +101,8 @@ class InputReader:
         return made
 
     def _check_serial_unit(self, number: int) -> None:
-        if not 1 <= number <= MAX_SERIAL_UNIT:
-            allowed = f"allowed on a serial line: 1 to {MAX_SERIAL_UNIT}"
+        if number == 0:
+            allowed = f"allowed on a serial line: 1 to {MAX_UNIT}"
             self.input.desk.problem(self.input.path, f"found slave_id {number}, {allowed}")
 
     def _interval(self) -> float:
