@@ -236,6 +236,26 @@ def test_typed_values_are_shown_with_their_registers(
 
 
 @pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("float32", [21.5, 0.1]),
+        ("float32[2]", [21.5, 0.1]),
+        ("bit:3", [True, False, True, True]),
+        ("uint64", [0x41AC00003DCCCCCD]),
+        ("bytes:3", ["41ac00", "3dcccc"]),
+    ],
+)
+def test_the_last_address_is_the_last_that_is_read_whatever_the_type(
+    server: holdfast.Server, memory: holdfast.Memory, kind: str, values: list[object]
+) -> None:
+    memory.write("holding_registers", 10, struct.unpack(">4H", struct.pack(">2f", 21.5, 0.1)))
+    found = answer("read", cli.url(server), "hr:10-13", "--type", kind)
+    assert (found["address"], found["count"]) == (10, 4)
+    assert found["values"] == values
+    assert answer("read", cli.url(server), "co:0-2", "--type", "bool")["values"] == [False] * 3
+
+
+@pytest.mark.parametrize(
     ("kind", "raw", "told", "value"),
     [
         ("int16", [0xFFFB], "-5", -5),
@@ -353,6 +373,14 @@ def test_a_modicon_number_names_area_and_address(
         (("hr", "0", "--type", "float33"), "type 'float33' is unknown"),
         (("hr", "0", "--type", "float32", "--order", "ABDC"), "order 'ABDC' is unknown"),
         (("co", "0", "--type", "float32"), "coils contain bits; the only type is bool."),
+        (
+            ("hr:0-8", "--type", "uint32"),
+            "'hr:0-8' is 9 registers, allowed with uint32: a multiple of 2.",
+        ),
+        (
+            ("hr:0-5", "--type", "float32[2]"),
+            "'hr:0-5' is 6 registers, allowed with float32[2]: a multiple of 4.",
+        ),
         (("hr", "0", "--times", "2"), "--times requires --every. For 10 values, type hr:0 10."),
         (
             ("hr", "0", "--every", "nan"),

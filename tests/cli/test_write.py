@@ -172,6 +172,11 @@ def test_many_values_are_written_by_several_requests_if_that_is_wanted(
         (("hr", "0", "1", "-v", "--", "-w"), "No such option '-v'."),
         (("hr", "0", "-5h", "--type", "int16"), "'-5h' is not an integer"),
         (("hr", "65535", "1", "2"), "65535"),
+        (
+            ("hr:0-1", "1", "--type", "uint64"),
+            "'hr:0-1' is 2 registers, the values are 4.",
+        ),
+        (("co:0-2", "1"), "'co:0-2' is 3 bits, the values are 1."),
     ],
 )
 def test_wrong_usage_is_told(words: tuple[str, ...], told: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -148,9 +148,21 @@ def _query(
         if kind is not None or order != "ABCD":
             raise click.UsageError("--type and --order can't be used with AREA:ADDRESS:TYPE.")
         kind, order = first.type, first.order
-    place, asked_count = first.place, count or 1
-    asked = typed(kind, order, encoding, place.area, asked_count)
-    query = _Query(place, asked_count if asked is None else asked.registers, asked)
+    place = first.place
+    asked = typed(kind, order, encoding, place.area, 1)
+    size = number = count or 1
+    if asked is not None:
+        if first.count is not None:
+            # FIRST-LAST are addresses also beside a type, as for `write`.
+            number, rest = divmod(first.count, asked.registers)
+            if rest:
+                raise click.UsageError(
+                    f"{first.text!r} is {terminal_text.counted(first.count, 'register')}, allowed "
+                    f"with {kind}: a multiple of {asked.registers}."
+                )
+        asked = replace(asked, count=asked.count * number)
+        size = asked.registers
+    query = _Query(place, size, asked)
     if place.address + query.size > ADDRESSES:
         items = terminal_text.counted(query.size, query.noun)
         raise click.UsageError(

@@ -145,8 +145,10 @@ def write(
             raise click.UsageError("--type and --order can't be used with AREA:ADDRESS:TYPE.")
         kind, order = first.type, first.order
     job = _job(place, left, kind, order, encoding, split)
-    if first.count not in (None, job.typed.registers):
-        raise click.UsageError(f"{first.text!r} takes {first.count}, found {job.typed.registers}.")
+    if first.count is not None and first.count != job.typed.registers:
+        noun = "bit" if place.area in BIT_AREAS else "register"
+        named = terminal_text.counted(first.count, noun)
+        raise click.UsageError(f"{first.text!r} is {named}, the values are {job.typed.registers}.")
     _carry_out(job, url, unit, timeout, verify=verify, dry_run=dry_run, as_json=as_json)
 
 
