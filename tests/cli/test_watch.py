@@ -9,10 +9,13 @@ import signal
 from typing import TYPE_CHECKING
 
 import pytest
+from rich.text import Text
 
 import holdfast
 from holdfast.cli.live.appliance_sources import by_modbus
 from holdfast.cli.live.changes import RATE_WINDOW_S, Tracker
+from holdfast.cli.live.registers_view import View
+from holdfast.cli.live.screen import with_whole_parts
 from holdfast.cli.live.sources import WatchedRange, cut, within
 from holdfast.config import load
 from support import cli, wire
@@ -471,6 +474,8 @@ def test_the_size_of_the_terminal_may_change(server: holdfast.Server) -> None:
         assert "turn pages" not in shown.rpartition("  288 ")[2]
         terminal.resize(8, 30)
         terminal.until("(1/")
+        terminal.resize(8, 20)
+        terminal.until("tcp://127.0.0.1:", "…", "holding_registers")
         terminal.keys("q")
         assert terminal.end() == 0
 
@@ -526,6 +531,58 @@ def test_rates_are_taken_over_the_last_time() -> None:
     for second in range(8, 30):
         tracker.update(second, [[14 - second, 5, 1, 0]])
     assert found[100][1].rate(29) == pytest.approx(-1)
+
+
+class Silence:
+    """A source of the live view that is never read."""
+
+    where = "tcp://127.0.0.1:5020, unit 1"
+    url = "tcp://127.0.0.1:5020"
+
+    def __init__(self, blocks: list[WatchedRange]) -> None:
+        self.blocks = blocks
+
+    def read(self) -> list[list[int]]:
+        raise AssertionError("not read")
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("memory", [None, "boiler_house_north_ring_main"])
+def test_no_number_is_cut_on_a_narrow_terminal(memory: str | None) -> None:
+    block = WatchedRange(memory, 1, "holding_registers", 12340, 8)
+    view = View(Silence([block]), [[0] * 8], 1, None)
+    view._tracker.update(view._tracker.at + 1, [[0] * 5 + [54321] + [0] * 2])
+    [(_, _, _, history)] = view._tracker.latest(1)
+    rate = history.rate(view._tracker.at)
+    whole = {"12345:", "54321", f"{rate:+.3g}", "/s", "1", "change", "…"}
+    before = [20.0]
+    for width in range(120, 10, -1):
+        [title, line] = [text.plain for text in view.foot(width)]
+        assert (title, len(line) <= width) == ("changing", True)
+        name, _, numbers = line.rpartition(" 12345: ")
+        words = numbers.split()
+        assert set(words) <= whole
+        # What does not fit is left out from the end, and the value last.
+        assert words[0] == ("54321" if width >= len("hr 12345: 54321") else "…")
+        assert name.split()[-1] in ("hr", "holding_registers")
+        assert memory is None or width < 40 or name.startswith("boiler_house_north")
+        for row in view.body(width)[1:]:
+            assert len(row.plain) <= width
+            assert set(row.plain.split()) <= {*map(str, range(12340, 12348)), "0", "54321"}
+    [*_, row, _, _] = view.body(10)
+    assert row.plain.split() == ["12345", "…"]
+
+
+@pytest.mark.parametrize("width", range(5, 90, 3))
+def test_parts_of_a_line_are_whole(width: int) -> None:
+    parts = [("every 0.25 s", ""), ("12345 readings", "")]
+    line = with_whole_parts(Text(Silence.where), parts, width).plain
+    longer = [
+        f"{Silence.where}   every 0.25 s   12345 readings",
+        f"{Silence.where}   every 0.25 s",
+    ]
+    assert line == next((each for each in longer if len(each) <= width), Silence.where)
 
 
 def test_only_the_latest_changes_are_listed() -> None:

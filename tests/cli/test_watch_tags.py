@@ -211,7 +211,7 @@ def test_no_line_is_too_long_and_no_number_is_cut(width: int) -> None:
         Reading(tag("a_name_that_is_quite_long_for_a_tag", unit="m³/h"), -1234.56789012345),
         Reading(tag("温度計の値段と名前", unit="°C"), 21.5),
         Reading(tag("energy", "uint64", unit="kWh"), 2**64 - 1),
-        Reading(tag("text", "string:60"), "x" * 60),
+        Reading(tag("text", "string:64"), "x" * 64),
         Reading(tag("refused"), error=ModbusException(2, "Illegal Data Address")),
     ]
     lines = shown(width, *readings)
@@ -220,6 +220,74 @@ def test_no_line_is_too_long_and_no_number_is_cut(width: int) -> None:
     if width > 20:
         assert "18446744073709551615" in " ".join(lines)
     assert width > 70 or any("…" in line for line in lines if "xxx" in line)
+
+
+@pytest.mark.parametrize(
+    ("width", "lines"),
+    [
+        (
+            28,
+            [
+                "power",
+                "  -8.637298209918441e-62 kWh",
+                "count  18446744073709551615",
+                "all    [12345,12346,-12347]",
+                "state       running hot (1)",
+            ],
+        ),
+        (
+            24,
+            [
+                "power",
+                "  -8.637298209918441e-62",
+                "count",
+                "  18446744073709551615",
+                "all",
+                "  [12345,12346,-12347]",
+                "state",
+                "  running hot (1)",
+            ],
+        ),
+        (
+            20,
+            [
+                "power",
+                "  … kWh",
+                "count",
+                "18446744073709551615",
+                "all",
+                "[12345,12346,-12347]",
+                "state",
+                "  running hot (1)",
+            ],
+        ),
+        (
+            14,
+            [
+                "power",
+                "  … kWh",
+                "count",
+                "  …",
+                "all",
+                "[12345,12346,…",
+                "state",
+                "running hot (…",
+            ],
+        ),
+        (4, ["pow…", "  …", "cou…", "  …", "all", "  …", "sta…", "run…"]),
+    ],
+)
+def test_without_room_a_number_is_left_out_not_cut(width: int, lines: list[str]) -> None:
+    assert (
+        shown(
+            width,
+            Reading(tag("power", unit="kWh"), -8.637298209918441e-62),
+            Reading(tag("count", "uint64"), 2**64 - 1),
+            Reading(tag("all", "int16[3]"), [12345, 12346, -12347]),
+            Reading(tag("state", "uint16", states={1: "running hot"}), 1),
+        )
+        == lines
+    )
 
 
 def test_columns_are_aligned() -> None:

@@ -9,10 +9,18 @@ from rich.text import Text
 
 from holdfast.cli import terminal_text
 from holdfast.cli.live.changes import Tracker
-from holdfast.cli.live.screen import FADE_READINGS, FRESH, RECENT, Screen
+from holdfast.cli.live.screen import (
+    CUT,
+    FADE_READINGS,
+    FRESH,
+    RECENT,
+    Screen,
+    whole,
+    with_whole_parts,
+)
 from holdfast.cli.live.sources import Unreadable
 from holdfast.errors import ModbusError
-from holdfast.types import BIT_AREAS
+from holdfast.types import BIT_AREAS, SHORT_OF
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -58,20 +66,21 @@ class View(Screen):
         for index, block in enumerate(self._tracker.blocks):
             if lines:
                 lines.append(Text())
-            lines.append(Text(_name(block), "bold"))
+            lines.append(Text(_named(block, "", width), "bold"))
             lines += self._block(index, block, width)
         return lines
 
     def _block(self, index: int, block: WatchedRange, width: int) -> list[Text]:
         cell = 2 if block.area in BIT_AREAS else 6
         most = 32 if cell == 2 else 16
+        cell = max(1, min(cell, width - 6))
         columns = max(1, min(most, 1 << max(0, (max(1, (width - 6) // cell)).bit_length() - 1)))
         values = self._tracker.values[index]
         lines = []
         for start in range(0, block.count, columns):
             line = Text.assemble((f"{block.address + start:>5} ", "dim"))
             for offset in range(start, min(start + columns, block.count)):
-                text = str(int(values[offset]))
+                text = whole(str(int(values[offset])), cell)
                 line.append(" " * (cell - len(text)))
                 line.append(text, self._style(index, block.address + offset))
             lines.append(line)
@@ -85,18 +94,32 @@ class View(Screen):
             return ""
         return FRESH if age == 0 else RECENT
 
-    def foot(self) -> list[Text]:
+    def foot(self, width: int) -> list[Text]:
         """The latest changes: value, rate and number of changes."""
         rows = []
         for block, address, value, history in self._tracker.latest(MAX_RATES):
             rate = history.rate(self._tracker.at)
             unit = "changes/s" if block.area in BIT_AREAS else "/s"
-            rows.append(
-                f"{_name(block)} {address}: {value:>5}   {rate:+.3g} {unit}   "
-                f"{terminal_text.counted(history.changes, 'change')}"
-            )
-        return [Text("changing", "bold"), *map(Text, rows)] if rows else []
+            line = _named(block, f" {address}: {value:>5}", width)
+            if len(line) > width:
+                line = _named(block, f" {address}: {CUT}", width)
+            parts = (f"{rate:+.3g} {unit}", terminal_text.counted(history.changes, "change"))
+            rows.append(with_whole_parts(Text(line), [(part, "") for part in parts], width))
+        return [Text("changing", "bold"), *rows] if rows else []
 
 
-def _name(block: WatchedRange) -> str:
-    return block.area if block.memory is None else f"{block.memory} {block.area}"
+def _named(block: WatchedRange, end: str, width: int) -> str:
+    """The name of a block, and what ends its line.
+
+    On a narrow terminal, the area is short and the name of the memory is cut, which leaves the
+    addresses of two areas distinct.
+    """
+    memory = "" if block.memory is None else f"{block.memory} "
+    line = f"{memory}{block.area}{end}"
+    if len(line) <= width:
+        return line
+    line = f"{SHORT_OF[block.area]}{end}"
+    room = width - len(line)
+    if len(memory) > room:
+        memory = f"{memory[: room - 2]}{CUT} " if room >= 2 else ""
+    return memory + line

@@ -8,8 +8,10 @@ import os
 import re
 import time
 from abc import ABC, abstractmethod
+from textwrap import shorten
 from typing import TYPE_CHECKING
 
+from rich.cells import cell_len
 from rich.console import Console, ConsoleDimensions, Group
 from rich.control import Control
 from rich.live import Live
@@ -20,7 +22,7 @@ from holdfast.cli.live import keys, schedule
 from holdfast.cli.signals import on_ctrl_z
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from holdfast.cli.live.keys import Wait
 
@@ -29,6 +31,12 @@ SIZE_CHECK_INTERVAL_S = 0.2
 
 FADE_READINGS = 3
 """A change stays highlighted for so many readings."""
+
+GAP = "   "
+"""Between the parts of a line."""
+
+CUT = "…"
+"""Stands for what has no room on a line."""
 
 FRESH = "bold reverse yellow"
 RECENT = "bold yellow"
@@ -71,7 +79,7 @@ class Screen(ABC):
         """The lines that are shown in pages."""
 
     @abstractmethod
-    def foot(self) -> Sequence[Text]:
+    def foot(self, width: int) -> Sequence[Text]:
         """The lines below them, on every page."""
 
     @abstractmethod
@@ -118,30 +126,60 @@ class Screen(ABC):
     def _draw(self) -> None:
         self._drawn = time.monotonic()
         self._size = width, height = self._console.size
-        foot = self.foot()
+        foot = self.foot(width)
         body = self.body(width)
         room = max(1, height - 3 - (len(foot) + 1 if foot else 0))
         self._pages = pages = max(1, math.ceil(len(body) / room))
         self._page = min(self._page, pages - 1)
         shown = body[self._page * room : (self._page + 1) * room]
-        keys_ = "q quits" + (f"   n, p turn pages ({self._page + 1}/{pages})" if pages > 1 else "")
-        lines = [*self._head(), *shown]
+        lines = [*self._head(width), *shown]
         if foot:
             lines += [Text(), *foot]
         lines += [Text()] * (height - 1 - len(lines))
-        lines.append(Text(keys_ + (f"   {self._note}" if self._note else ""), "dim"))
+        lines.append(self._keys(width))
         for line in lines:
-            line.truncate(width)
+            line.truncate(width, overflow="ellipsis")
         self._live.update(Group(*lines), refresh=True)
 
-    def _head(self) -> list[Text]:
+    def _keys(self, width: int) -> Text:
+        """The keys, the page, and the note."""
+        line = Text("q quits", "dim")
+        if self._pages > 1:
+            page = f"({self._page + 1}/{self._pages})"
+            is_wide = len(f"{line}{GAP}n, p turn pages {page}") <= width
+            line.append(f"{GAP}n, p {'turn pages ' if is_wide else ''}{page}")
+        if self._note:
+            room = max(1, width - line.cell_len - len(GAP))
+            line.append(GAP + shorten(self._note, room, placeholder=f" {CUT}"))
+        return line
+
+    def _head(self, width: int) -> list[Text]:
         readings, errors, error = self.state()
         counts = terminal_text.counted(readings, "reading")
-        head = Text.assemble(
-            (self._where, "bold"),
-            f"   every {self._every:g} s   {counts}   {terminal_text.clock()[:8]}",
-        )
+        parts = [
+            (part, "") for part in (f"every {self._every:g} s", counts, terminal_text.clock()[:8])
+        ]
         if errors:
-            head.append(f"   {terminal_text.counted(errors, 'error')}", "red")
+            parts.append((terminal_text.counted(errors, "error"), "red"))
+        head = with_whole_parts(Text(self._where, "bold"), parts, width)
         second = Text(terminal_text.plain(error), "bold red") if error else Text()
         return [head, second]
+
+
+def with_whole_parts(line: Text, parts: Iterable[tuple[str, str]], width: int) -> Text:
+    """A line with further parts and their styles, up to the first that does not fit.
+
+    No part is cut: the first digits of a number are another number.
+    """
+    line = Text.assemble(line)
+    for part, style in parts:
+        if line.cell_len + len(GAP) + cell_len(part) > width:
+            break
+        line.append(GAP)
+        line.append(part, style)
+    return line
+
+
+def whole(number: str, width: int) -> str:
+    """A number, or an ellipsis alone if it does not fit."""
+    return number if cell_len(number) <= width else CUT

@@ -9,7 +9,7 @@ from rich.cells import cell_len, set_cell_size
 from rich.text import Text
 
 from holdfast.cli import terminal_text
-from holdfast.cli.live.screen import FADE_READINGS, FRESH, RECENT, Screen
+from holdfast.cli.live.screen import CUT, FADE_READINGS, FRESH, RECENT, Screen
 from holdfast.cli.tags.changes import TagTracker
 from holdfast.cli.tags.read import value_shown
 
@@ -53,7 +53,7 @@ class TagView(Screen):
         tracker = self._tracker
         return tracker.readings, tracker.errors, str(tracker.error or "")
 
-    def foot(self) -> list[Text]:
+    def foot(self, width: int) -> list[Text]:  # noqa: ARG002
         """Nothing."""
         return []
 
@@ -68,7 +68,10 @@ class TagView(Screen):
 
 
 class _Row:
-    """A tag on the screen. Its value is never cut: without room beside the name, it is below."""
+    """A tag on the screen. Without room beside the name, its value is below, if need be alone.
+
+    A text is cut there. Of a number, no digits are left out: what remained would be another one.
+    """
 
     def __init__(self, tracked: Tracked, tracker: TagTracker) -> None:
         tag = tracked.tag
@@ -76,6 +79,9 @@ class _Row:
         has_value = tracked.was_read and tracked.value is not None
         self.value = value_shown(tag, tracked.value) if tracked.was_read else "-"
         self.unit = terminal_text.plain(tag.unit) if has_value else ""
+        self._is_text = has_value and (
+            isinstance(tracked.value, str | bytes) or tag.state(tracked.value) is not None
+        )
         self.note = ""
         self._style = "" if has_value else "dim"
         if tracked.error is not None:
@@ -101,10 +107,11 @@ class _Row:
         else:
             lines.append(Text(self.name))
             lines[0].truncate(width, overflow="ellipsis")
-            row = Text.assemble(
-                " " * GAP_COLUMNS, (self.value, self._style), f" {self.unit}".rstrip()
-            )
-            row.truncate(width, overflow="ellipsis")
+            shown = self._fitted(width)
+            indent = " " * GAP_COLUMNS if GAP_COLUMNS + cell_len(shown) <= width else ""
+            row = Text.assemble(indent, (shown, self._style))
+            if self.unit and row.cell_len + 1 + cell_len(self.unit) <= width:
+                row.append(f" {self.unit}")
         if not self.note:
             return [*lines, row]
         start = names + GAP_COLUMNS + values + (units + 1 if units else 0) + GAP_COLUMNS
@@ -115,6 +122,13 @@ class _Row:
         note = Text.assemble(" " * GAP_COLUMNS, (self.note, "red"))
         note.truncate(width, overflow="ellipsis")
         return [*lines, row, note]
+
+    def _fitted(self, width: int) -> str:
+        """The value in this width; else the start of a text, or the first numbers of an array."""
+        if cell_len(self.value) <= width:
+            return self.value
+        start = set_cell_size(self.value, width - 1)
+        return (start if self._is_text else start[: start.rfind(",") + 1]) + CUT
 
 
 def _fitted(name: str, width: int) -> str:
