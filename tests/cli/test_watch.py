@@ -424,6 +424,22 @@ def test_a_signal_leaves_the_terminal_as_it_was(
     assert terminal.shown.endswith("\x1b[?25h\x1b[?1049l")
 
 
+@pytest.mark.parametrize("words", [("hr", "0"), ("hr:0", "hr:1")])
+@pytest.mark.parametrize("code", [None, 2])
+def test_a_terminal_that_is_closed_ends_the_view_like_a_signal(
+    words: tuple[str, ...], code: int | None
+) -> None:
+    with (
+        FakeDevice(registers) as device,
+        Terminal("watch", device.url, *words, "--every", "0.05") as terminal,
+    ):
+        terminal.until("q quits")
+        if code is not None:  # What the device answers last is a reason for a hint.
+            device.answer = lambda pdu: exception(pdu, code)
+            terminal.until(f"exception 0{code}")
+        assert terminal.hang_up() == 0
+
+
 def test_ctrl_z_leaves_the_screen_until_the_view_continues(server: holdfast.Server) -> None:
     # Without a shell that could continue it, the process is not stopped, but continues at once.
     with Terminal("watch", cli.url(server), "hr", "0", "--every", "1h") as terminal:
@@ -556,7 +572,6 @@ def test_no_number_is_cut_on_a_narrow_terminal(memory: str | None) -> None:
     [(_, _, _, history)] = view._tracker.latest(1)
     rate = history.rate(view._tracker.at)
     whole = {"12345:", "54321", f"{rate:+.3g}", "/s", "1", "change", "…"}
-    before = [20.0]
     for width in range(120, 10, -1):
         [title, line] = [text.plain for text in view.foot(width)]
         assert (title, len(line) <= width) == ("changing", True)

@@ -61,7 +61,8 @@ class Terminal:
     ) -> None:
         self.process.kill()
         self.process.wait()
-        os.close(self._own)
+        if self._own >= 0:
+            os.close(self._own)
 
     def until(self, *texts: str) -> str:
         """Waits until the output since the last call contains all texts. Returns it."""
@@ -92,6 +93,12 @@ class Terminal:
         deadline = time.monotonic() + wire.DEADLINE
         while self._look(deadline):
             assert time.monotonic() < deadline, plain(self.shown)
+        return self.process.wait(wire.DEADLINE)
+
+    def hang_up(self) -> int:
+        """Closes the terminal, which sends SIGHUP. Returns the exit code."""
+        os.close(self._own)
+        self._own = -1
         return self.process.wait(wire.DEADLINE)
 
     def _look(self, deadline: float) -> bool:

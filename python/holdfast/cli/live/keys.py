@@ -38,7 +38,8 @@ def keys() -> Iterator[Wait]:
             tty.setcbreak(terminal)
 
         def leave() -> None:
-            termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+            with contextlib.suppress(termios.error):  # A closed terminal has no modes.
+                termios.tcsetattr(terminal, termios.TCSADRAIN, before)
 
         with on_ctrl_z(leave, take):
             try:

@@ -17,7 +17,7 @@ from rich.control import Control
 from rich.live import Live
 from rich.text import Text
 
-from holdfast.cli import terminal_text
+from holdfast.cli import standard_output, terminal_text
 from holdfast.cli.live import keys, schedule
 from holdfast.cli.signals import on_ctrl_z
 
@@ -87,7 +87,22 @@ class Screen(ABC):
         """The numbers of readings and of errors, and the error of the last reading, or ""."""
 
     def run(self, times: int | None) -> None:
-        """Shows readings until q or Ctrl-C. The first one has been read before."""
+        """Shows readings until q or Ctrl-C. The first one has been read before.
+
+        Raises `KeyboardInterrupt` if the terminal was closed: nothing more can be printed.
+        """
+        try:
+            self._show(times)
+            if standard_output.is_screen():
+                return
+        except (OSError, KeyboardInterrupt):
+            if standard_output.is_screen():
+                raise
+        # Its end is found by a key, by what can't be written, or by SIGHUP, in any order.
+        standard_output.leave()
+        raise KeyboardInterrupt
+
+    def _show(self, times: int | None) -> None:
         with (
             contextlib.suppress(Quit, KeyboardInterrupt),
             keys.keys() as wait,
