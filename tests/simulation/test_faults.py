@@ -14,6 +14,7 @@ import holdfast
 from holdfast.errors import ConnectionLost, ModbusException, RequestTimeout
 from holdfast.simulation.faults import FaultProxy, Faults
 from support import wire
+from support.machine import has_ipv6
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -102,6 +103,13 @@ def test_bytes_that_are_no_frame_end_the_connection(server: holdfast.Server, dat
             with contextlib.suppress(ConnectionResetError):
                 assert peer.recv(100) == b""
         assert outcomes(url, 1, 5) == [[0]]
+
+
+@pytest.mark.skipif(not has_ipv6(), reason="needs IPv6")
+def test_all_addresses_include_those_of_ipv4(server: holdfast.Server) -> None:
+    everywhere = FaultProxy(("::", 0), server.address, Faults(drop=0.01), Random("1"), EVERYONE)
+    with everywhere as running:
+        assert outcomes(f"tcp://127.0.0.1:{running.address[1]}", 1, 5) == [[0]]
 
 
 def test_an_address_in_use_is_an_error(server: holdfast.Server) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import socket
 import struct
 import threading
 from dataclasses import dataclass
@@ -69,10 +70,8 @@ class FaultProxy:
     def start(self) -> Self:
         """Listens. Raises `OSError`."""
         self._thread.start()
-        host, port = self.address
-        opening = asyncio.start_server(self._accept, host, port)
         try:
-            self._server = asyncio.run_coroutine_threadsafe(opening, self._loop).result()
+            self._server = asyncio.run_coroutine_threadsafe(self._listen(), self._loop).result()
         except BaseException:
             self._end()
             raise
@@ -89,6 +88,13 @@ class FaultProxy:
 
     def __exit__(self, *_: object) -> None:
         self.stop()
+
+    async def _listen(self) -> asyncio.Server:
+        if self.address[0] != "::":
+            return await asyncio.start_server(self._accept, *self.address)
+        # asyncio would accept only IPv6 there, unlike all other servers.
+        opened = socket.create_server(self.address, family=socket.AF_INET6, dualstack_ipv6=True)
+        return await asyncio.start_server(self._accept, sock=opened)
 
     def _end(self) -> None:
         self._loop.call_soon_threadsafe(self._loop.stop)
