@@ -19,11 +19,14 @@ from support.brokers import free_port
 from support.certificates import Certificates
 from support.cli import RunCommand, answer, done, invoke, usage_error
 from support.config_folder import written
+from support.machine import has_ipv6
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from typing import Any
 
+
+needs_ipv6 = pytest.mark.skipif(not has_ipv6(), reason="needs IPv6")
 
 RULES = [{"sources": ["127.0.0.0/8"], "units": {1: "plant"}, "access": "read-only"}]
 PLANT = {
@@ -115,6 +118,26 @@ def test_the_gateway_is_asked_where_there_are_no_metrics(
     run(gateway={"bind": f"127.0.0.1:{free_port()}", "tokens": "none", **gateway})
     file = str(tmp_path / "plant.yaml")
     wire.until(lambda: invoke("health", file).exit_code == 0, "it is ready")
+
+
+@needs_ipv6
+@pytest.mark.parametrize("source", ["127.0.0.0/8", "::1"])
+def test_what_listens_everywhere_is_asked_from_a_source_that_it_admits(
+    run: Callable[..., RunCommand], tmp_path: Path, source: str
+) -> None:
+    run(metrics={"bind": f"[::]:{free_port()}", "sources": [source]})
+    file = str(tmp_path / "plant.yaml")
+    wire.until(lambda: invoke("health", file).exit_code == 0, "it is ready")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", pytest.param("[::]", marks=needs_ipv6)])
+def test_sources_without_this_machine_are_told(
+    run: Callable[..., RunCommand], tmp_path: Path, host: str
+) -> None:
+    run(metrics={"bind": f"{host}:{free_port()}", "sources": ["10.0.0.0/8"]})
+    found = answer("health", str(tmp_path / "plant.yaml"), code=1)
+    assert (found["ok"], found["reason"]) == (False, "connection")
+    assert found["detail"].endswith("; metrics.sources does not contain 127.0.0.1")
 
 
 def test_https_is_verified_where_authorities_are_given(

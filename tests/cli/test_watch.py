@@ -12,7 +12,7 @@ import pytest
 from rich.text import Text
 
 import holdfast
-from holdfast.cli.live.appliance_sources import by_modbus
+from holdfast.cli.live.appliance_sources import Rest, by_modbus
 from holdfast.cli.live.changes import RATE_WINDOW_S, Tracker
 from holdfast.cli.live.registers_view import View
 from holdfast.cli.live.screen import with_whole_parts
@@ -296,6 +296,24 @@ def test_what_a_unit_may_not_read_is_not_watched(tmp_path: Path) -> None:
     file.write_text(memories + listener.replace("SCADA", "5020"))
     _, _, blocks = by_modbus(load(file))
     assert blocks == [WatchedRange("pumps", 2, "holding_registers", 2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("source", "host"), [("127.0.0.0/8", "127.0.0.1"), ('"::1"', "[::1]"), ('"::/0"', "[::1]")]
+)
+def test_what_listens_everywhere_is_read_from_a_source_that_it_admits(
+    source: str, host: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "plant.yaml"
+    listener = LISTENER.replace("127.0.0.1:SCADA", '"[::]:5020"').replace("127.0.0.0/8", source)
+    granted = token("panel", "s3cret", memories=("pumps",))
+    rest = REST.replace("127.0.0.1:REST", '"[::]:5021"').replace("TOKENS", json.dumps([granted]))
+    file.write_text(MEMORIES + listener + rest.replace("127.0.0.1", source))
+    config = load(file)
+    _, address, blocks = by_modbus(config)
+    assert (address, len(blocks)) == (f"{host}:5020", 2)
+    assert config.rest is not None
+    assert Rest(config.rest, [], None, 1).url == f"http://{host}:5021"
 
 
 def test_the_first_reading_must_succeed(server: holdfast.Server, tmp_path: Path) -> None:

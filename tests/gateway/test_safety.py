@@ -896,7 +896,7 @@ def test_the_greeting_has_an_example_that_may_be(allow: str, example: str) -> No
     ("scheme", "host", "url"),
     [
         ("http", "0.0.0.0", "http://127.0.0.1:8090"),
-        ("https", "::", "https://[::1]:8090"),
+        ("https", "::", "https://127.0.0.1:8090"),
         ("http", "10.0.0.9", "http://10.0.0.9:8090"),
     ],
 )

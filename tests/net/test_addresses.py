@@ -114,6 +114,25 @@ def test_a_host_is_an_address_or_a_name() -> None:
 def test_what_listens_everywhere_is_reached_on_this_machine() -> None:
     assert [reachable(host) for host in ("0.0.0.0", "::", "10.0.0.7")] == [
         "127.0.0.1",
-        "::1",
+        "127.0.0.1",
         "10.0.0.7",
     ]
+
+
+@pytest.mark.parametrize(
+    ("sources", "host"),
+    [
+        (["127.0.0.0/8"], "127.0.0.1"),
+        (["::1/128"], "::1"),
+        (["::/0"], "::1"),
+        (["::1/128", "127.0.0.1/32"], "127.0.0.1"),
+        (["10.0.0.0/8"], "127.0.0.1"),
+    ],
+)
+def test_what_listens_everywhere_is_reached_from_a_source_that_it_admits(
+    sources: list[str], host: str
+) -> None:
+    networks = [ip_network(each) for each in sources]
+    assert reachable("::", networks) == host
+    assert reachable("0.0.0.0", networks) == "127.0.0.1"
+    assert reachable("fd00::9", networks) == "fd00::9"

@@ -62,6 +62,11 @@ def holds(networks: Iterable[Network], address: Address) -> bool:
     return any(plain in network for network in networks)
 
 
+def admits(sources: Iterable[Network], host: str) -> bool:
+    """Returns whether one of the networks contains a host that is an address."""
+    return holds(sources, parse_address(host))
+
+
 def covers(networks: Iterable[Network], network: Network) -> bool:
     """Returns whether `networks` together contain every address of `network`."""
     same: list[Any] = [each for each in networks if each.version == network.version]
@@ -83,9 +88,15 @@ def joined(host: str, port: int) -> str:
     return f"{bracketed(host)}:{port}"
 
 
-def reachable(host: str) -> str:
-    """Returns the address at which a local client reaches a listening address."""
-    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+def reachable(host: str, sources: Iterable[Network] = LOOPBACK) -> str:
+    """Returns the address at which a local client, if `sources` admit it, reaches a listening one.
+
+    `::` also accepts IPv4, which every system has: `::1` only if `sources` admit no other.
+    """
+    if host not in {"0.0.0.0", "::"}:
+        return host
+    needs_ipv6 = host == "::" and admits(sources, "::1") and not admits(sources, "127.0.0.1")
+    return "::1" if needs_ipv6 else "127.0.0.1"
 
 
 def certificate_name(host: str) -> str:

@@ -19,7 +19,7 @@ from holdfast.cli.options.duration import Duration, timeout_option
 from holdfast.cli.options.option import flag, json_option, option
 from holdfast.cli.options.tls import tls_options
 from holdfast.cli.terminal_text import plain, print_json, show_problems, table
-from holdfast.net.addresses import joined, reachable
+from holdfast.net.addresses import admits, joined, reachable
 from holdfast.net.http import health as probes
 from holdfast.runtime.bounded_files import require_stored
 
@@ -57,16 +57,18 @@ def health(
     """
     if (file is None) == (url is None):
         raise click.UsageError("Give either FILE or --url.")
+    hint = ""
     if url is None:
         assert file is not None
-        base, context = _url_from_config(file), _context(tls, verified=tls.ca is not None)
+        base, hint = _url_from_config(file)
+        context = _context(tls, verified=tls.ca is not None)
     else:
         base, context = _checked_url(url), _context(tls, verified=True)
     path = probes.LIVE if live else probes.READY
     try:
         probe = _probe(base, path, timeout, context)
     except _NoAnswer as error:
-        fail(f"{base}{path}: {error}", reason="connection", target=f"{base}{path}")
+        fail(f"{base}{path}: {error}{hint}", reason="connection", target=f"{base}{path}")
     state = "live" if live else "ready"
     if as_json:
         failed = [name for name, check in probe["checks"].items() if not check["ok"]]
@@ -79,8 +81,11 @@ def health(
     sys.exit(ExitCode.SUCCESS if probe["ok"] else ExitCode.FAILED)
 
 
-def _url_from_config(file: Path) -> str:
-    """The URL of the service in a configuration. Exits with 2 if it has none."""
+def _url_from_config(file: Path) -> tuple[str, str]:
+    """The URL of the service in a configuration, and why it may refuse this machine.
+
+    Exits with 2 if there is none.
+    """
     from holdfast.config import ConfigError, load
 
     try:
@@ -95,7 +100,10 @@ def _url_from_config(file: Path) -> str:
         if service.bind.port == 0:
             raise click.UsageError(f"{file}: {name}.bind has port 0: use --url.")
         scheme = "http" if service.tls is None else "https"
-        return f"{scheme}://{joined(reachable(service.bind.host), service.bind.port)}"
+        host = reachable(service.bind.host, service.sources)
+        refused = not admits(service.sources, host)
+        hint = f"; {name}.sources does not contain {host}" if refused else ""
+        return f"{scheme}://{joined(host, service.bind.port)}", hint
     sections = " or ".join(f"`{name}`" for name in SERVICES)
     raise click.UsageError(f"{file} has no section {sections}, which answer probes.")
 

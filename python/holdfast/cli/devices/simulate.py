@@ -127,12 +127,14 @@ def simulate(
     simulated = _device(tags, chosen, play, every, seed)
     faults = Faults(latency, drop, refuse, code)
     signals = Signals()
+    allowed = sources or LOOPBACK
     with ExitStack() as running:
         try:
-            where = _serve(running, simulated, bind, unit, sources or LOOPBACK, faults, seed)
+            host, port = _serve(running, simulated, bind, unit, allowed, faults, seed)
         except OSError as error:
             fail(f"{unbindable(bind, error)}; --bind sets another address or port")
-        announce(_greeting(file, profile, tags, where, unit))
+        url = f"tcp://{joined(reachable(host, allowed), port)}"
+        announce(_greeting(file, profile, tags, url, unit))
 
         def wait(seconds: float) -> None:
             if signals.received:
@@ -219,11 +221,7 @@ def _serve(
     return running.enter_context(front).address
 
 
-def _greeting(
-    file: Path | None, profile: str | None, tags: TagList, where: tuple[str, int], unit: int
-) -> str:
-    host, port = where
-    url = f"tcp://{joined(reachable(host), port)}"
+def _greeting(file: Path | None, profile: str | None, tags: TagList, url: str, unit: int) -> str:
     served = f"{file or 'A heater'} is simulated at {url}, unit {unit}"
     lines = [f"{served}: {terminal_text.counted(len(tags), 'tag')}.", "", "Try:", ""]
     lines += _unknown(url, unit) if file is None else _known(file, profile, tags, url, unit)

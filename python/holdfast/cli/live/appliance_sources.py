@@ -60,11 +60,11 @@ class Rest:
     ) -> None:
         bind = settings.bind
         scheme = "http" if settings.tls is None else "https"
-        self.url = f"{scheme}://{_shown(bind)}"
+        address = reachable(bind.host, settings.sources), bind.port
+        self.url = f"{scheme}://{joined(*address)}"
         self.where = f"REST at {self.url}"
         self.blocks = list(blocks)
         self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
-        address = reachable(bind.host), bind.port
         self._connection = (
             http.client.HTTPConnection(*address, timeout=timeout)
             if settings.tls is None
@@ -113,8 +113,8 @@ def readable(
     if rest is not None:
         needed = None if rest.tokens == "none" else token
         return by_rest(config, token), lambda blocks, timeout: Rest(rest, blocks, needed, timeout)
-    name, bind, found = by_modbus(config)
-    url = f"tcp://{_shown(bind)}"
+    name, address, found = by_modbus(config)
+    url = f"tcp://{address}"
 
     def over_modbus(blocks: list[WatchedRange], timeout: float) -> Source:
         client = device.connect(url, blocks[0].unit, timeout)
@@ -148,8 +148,11 @@ def by_rest(config: Config, token: str | None) -> list[WatchedRange]:
     ]
 
 
-def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
-    """The first Modbus TCP listener, and its readable memories. Raises `Unwatchable`."""
+def by_modbus(config: Config) -> tuple[str, str, list[WatchedRange]]:
+    """The first Modbus TCP listener, where it is reached, and its readable memories.
+
+    Raises `Unwatchable`.
+    """
     found = [
         (name, listener)
         for name, listener in config.listeners.items()
@@ -159,8 +162,9 @@ def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
         raise Unwatchable("found neither rest nor a listener of type modbus-tcp")
     name, listener = found[0]
     _check_port(f"listener {name}", listener.bind)
-    host = parse_address(reachable(listener.bind.host))
-    rules = matching(listener.rules, host)
+    sources = [source for rule in listener.rules for source in rule.sources]
+    host = reachable(listener.bind.host, sources)
+    rules = matching(listener.rules, parse_address(host))
     if not rules:
         raise Unwatchable(f"no rule of listener {name} admits {host}")
     blocks: list[WatchedRange] = []
@@ -172,11 +176,7 @@ def by_modbus(config: Config) -> tuple[str, Bind, list[WatchedRange]]:
         if readable:
             seen.add(rights.memory)
             blocks += readable
-    return name, listener.bind, blocks
-
-
-def _shown(bind: Bind) -> str:
-    return joined(reachable(bind.host), bind.port)
+    return name, joined(host, listener.bind.port), blocks
 
 
 def _check_port(what: str, bind: Bind) -> None:

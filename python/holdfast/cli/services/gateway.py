@@ -153,7 +153,7 @@ def _greeting(appliance: Appliance) -> str:
 
 
 def _greeting_text(scheme: str, host: str, port: int, settings: Settings) -> str:
-    url = f"{scheme}://{joined(reachable(host), port)}"
+    url = f"{scheme}://{joined(reachable(host, settings.sources), port)}"
     can = "reads and writes" if settings.writes else "reads"
     who = ", ".join(name for name, _ in settings.tokens) or "no tokens"
     example, its_port = _example(settings.allow[0])

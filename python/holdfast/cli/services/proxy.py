@@ -161,7 +161,7 @@ def _greeting(appliance: Appliance, config: Config, target: Target, unit: int | 
     [rule] = listener.rules
     key = next(iter(rule.units))
     units = f"unit ids {key} pass through" if unit is None else f"all unit ids are unit {unit}"
-    url = f"tcp://{joined(reachable(listening.host), listening.port)}"
+    url = f"tcp://{joined(reachable(listening.host, rule.sources), listening.port)}"
     sources = ", ".join(map(str, rule.sources))
     return "\n".join(
         [

@@ -283,7 +283,7 @@ def _suggestions(appliance: Appliance, endpoints: list[ListenAddress], file: Pat
         for rule in endpoint.settings.rules:
             unit, rights = next(unit_rights(rule))
             place = f"mbpoll -m tcp -p {endpoint.port} -a {unit} -0"
-            host = reachable(endpoint.host)
+            host = reachable(endpoint.host, rule.sources)
             if rights.memory is None:
                 return [f"{place} -t 4 -r 0 -c 1 -1 {host}", check]
             area, addresses = _example(appliance.memories[rights.memory].areas, rights)
