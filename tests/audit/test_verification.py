@@ -5,6 +5,9 @@ from __future__ import annotations
 import contextlib
 import gzip
 import json
+import os
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -19,7 +22,6 @@ from holdfast.events.audit.chain import digest_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from click.testing import Result
 
@@ -331,6 +333,33 @@ def test_a_file_that_is_not_an_audit_log_is_refused(
     result = asked(file)
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr.startswith(f"holdfast: {file}: {reason}")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs pipes as files")
+def test_a_pipe_is_refused(tmp_path: Path) -> None:
+    named = tmp_path / "audit.log"
+    os.mkfifo(named)
+    end, other = os.pipe()
+    try:
+        for file, kind in (
+            (named, "a pipe"),
+            (f"/dev/fd/{end}", "a pipe"),
+            ("/dev/null", "a special file"),
+        ):
+            result = asked(file)
+            assert (result.exit_code, result.stdout) == (2, "")
+            told = f"it is {kind}, allowed: a regular file"
+            assert result.stderr == f"holdfast: {file}: {told}\n"
+    finally:
+        os.close(end)
+        os.close(other)
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="the system has no /proc")
+def test_an_error_while_a_file_is_read_names_it() -> None:
+    result = asked("/proc/self/mem")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr == "holdfast: /proc/self/mem: Input/output error\n"
 
 
 def test_an_empty_file_of_a_log_is_intact(log: Path) -> None:

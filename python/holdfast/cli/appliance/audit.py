@@ -14,6 +14,7 @@ from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import json_option, option
 from holdfast.config.values.scalars import parse_sha256
 from holdfast.events.audit import verify as verified
+from holdfast.runtime.text import file_error_text
 
 if TYPE_CHECKING:
     from holdfast.events.audit import Findings
@@ -52,7 +53,7 @@ def verify(files: tuple[Path, ...], anchors: tuple[str, ...], as_json: bool) -> 
     try:
         findings = verified(files, anchors)
     except OSError as error:
-        fail(f"{error.filename}: {error.strerror}", ExitCode.WRONG, reason="file")
+        fail(file_error_text(error), ExitCode.WRONG, reason="file")
     click.echo(_as_json(findings) if as_json else _as_text(findings))
     if _wrong(findings):
         sys.exit(ExitCode.FAILED)

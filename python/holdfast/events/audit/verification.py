@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import itertools
 import re
+import stat
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import partial
@@ -120,7 +121,14 @@ def verify(files: Iterable[Path], anchors: Iterable[str] = ()) -> Findings:
 
 
 def _require_log(file: Path) -> None:
-    """Raises `OSError` for a file with lines, none of which is one of an audit log."""
+    """Raises `OSError` for a file with lines, none of which is one of an audit log.
+
+    Also for one that can't be read again and again; opening a pipe can wait forever.
+    """
+    mode = file.stat().st_mode
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        kind = "a pipe" if stat.S_ISFIFO(mode) else "a special file"
+        raise OSError(errno.EINVAL, f"it is {kind}, allowed: a regular file", str(file))
     start = next(_lines([file]), None)
     # A record may be the first one, and incomplete.
     if start is None or start.data.startswith(RECORD_START) or any(map(_is_of_log, _lines([file]))):
@@ -249,8 +257,12 @@ def _lines(files: Iterable[Path]) -> Iterator[Line]:
     for file in files:
         with file.open("rb") as opened:
             read = partial(opened.readline, MAX_LINE_BYTES)
-            for number, data in enumerate(iter(read, b""), 1):
-                yield Line(file, number, data, place_of(data))
+            try:
+                for number, data in enumerate(iter(read, b""), 1):
+                    yield Line(file, number, data, place_of(data))
+            except OSError as error:
+                error.filename = str(file)  # Only errors of opening have it.
+                raise
 
 
 def _with_next(lines: Iterable[Line]) -> Iterator[tuple[Line, Line | None]]:
