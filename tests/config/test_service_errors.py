@@ -576,6 +576,14 @@ def test_messages_that_a_broker_keeps_for_one_of_several_nodes_are_a_warning(
     assert [each.partition(": ")[2] for each in found] == [KEPT.format(each) for each in told]
 
 
+@pytest.mark.parametrize("found", ["true", "1.0", "3.0", "2", '"3"'])
+def test_replicas_of_a_log_are_one_of_three_numbers(folder: Folder, found: str) -> None:
+    servers = f"servers: [nats://10.0.0.1:4222], replicas: {found}"
+    [problem] = folder.problems(SHARED.replace("SERVERS", servers).replace("QOS", "0"))
+    told = found.replace('"', "'")
+    assert problem.endswith(f": logs.site.replicas: found {told}, allowed: 1, 3 or 5")
+
+
 PASSED = """\
 memories: {plant: {coils: 8, holding_registers: 100, input_registers: 10}}
 devices:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, Strict, model_validator
+from pydantic import BeforeValidator, Field, Strict, model_validator
 
 from holdfast._core import MAX_LAG_S, WRITE_TIMEOUT_S
 from holdfast.config.models.services import NatsServersConfig
@@ -14,6 +14,7 @@ from holdfast.config.values.scalars import (
     Name,
     NatsUrl,
     NotNull,
+    integral,
     seconds,
     whole_number,
 )
@@ -42,7 +43,7 @@ class SharedLogConfig(NatsServersConfig):
     """The folder of a NATS server that is started with the appliance; requires nats-server."""
     node: Name
     """The name of this appliance in the log; unique."""
-    replicas: Literal[1, 3, 5] = 1
+    replicas: Annotated[Literal[1, 3, 5], BeforeValidator(integral)] = 1
     """On how many servers each write is, when it is confirmed."""
     write_timeout: Seconds = WRITE_TIMEOUT_S
     """Seconds until a write that the log has not confirmed is answered with exception 04."""
