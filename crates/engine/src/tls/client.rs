@@ -459,7 +459,26 @@ mod tests {
             outcome(&certificate, b"-----BEGIN ENCRYPTED PRIVATE KEY-----\n"),
             "KEY: the key is encrypted; use a key without a passphrase"
         );
-        assert!(outcome(&certificate[..100], key.as_bytes()).starts_with("CERT: "));
+        assert_eq!(
+            outcome(&certificate[..100], key.as_bytes()),
+            "CERT: it ends inside a CERTIFICATE"
+        );
+        assert_eq!(
+            outcome(&certificate, &key.as_bytes()[..100]),
+            "KEY: it ends inside a PRIVATE KEY"
+        );
+        assert_eq!(
+            outcome(&certificate, key.replace('\n', "").as_bytes()),
+            "KEY: it ends inside a block, allowed: PEM, in lines"
+        );
+        assert_eq!(
+            outcome(&certificate, key.replacen('\n', "", 1).as_bytes()),
+            "KEY: a line that begins with -----BEGIN does not end with -----"
+        );
+        assert_eq!(
+            outcome(&certificate.replace("MII", "M*I"), key.as_bytes()),
+            "CERT: a block is not base64"
+        );
         assert_eq!(
             outcome(
                 "-----BEGIN CERTIFICATE-----\nMAA=\n-----END CERTIFICATE-----\n",

@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
-use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::pem::{self, PemObject, SectionKind};
 use rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use rustls::server::ParsedCertificate;
 use thiserror::Error;
@@ -29,6 +29,24 @@ impl FileError {
     pub(super) fn content(file: &Path, flaw: impl Into<String>) -> FileError {
         FileError::Content { file: file.display().to_string(), flaw: flaw.into() }
     }
+
+    /// Shows no part of the file, as the messages of `error` do: a line can have a whole key.
+    pub(super) fn not_pem(file: &Path, error: &pem::Error) -> FileError {
+        let flaw = match error {
+            pem::Error::MissingSectionEnd { end_marker } => {
+                match SectionKind::try_from(end_marker.as_slice()) {
+                    Ok(_) => &format!("it ends inside a {}", end_marker.escape_ascii()),
+                    Err(()) => "it ends inside a block, allowed: PEM, in lines",
+                }
+            }
+            pem::Error::IllegalSectionStart { .. } => {
+                "a line that begins with -----BEGIN does not end with -----"
+            }
+            pem::Error::Base64Decode(_) => "a block is not base64",
+            _ => "it is not PEM",
+        };
+        FileError::content(file, flaw)
+    }
 }
 
 /// Reads all certificates of a file, in order; at least one.
@@ -38,7 +56,7 @@ impl FileError {
 pub(super) fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, FileError> {
     let text = read(file)?;
     let found: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(&text).collect();
-    let found = found.map_err(|error| FileError::content(file, error.to_string()))?;
+    let found = found.map_err(|error| FileError::not_pem(file, &error))?;
     if found.is_empty() {
         return Err(FileError::content(file, missing(&text, "certificate")));
     }
@@ -70,7 +88,7 @@ pub(super) fn key_of(file: &Path, text: &[u8]) -> Result<PrivateKeyDer<'static>,
         return Err(FileError::content(file, flaw));
     }
     match PrivateKeyDer::pem_slice_iter(text).next() {
-        Some(found) => found.map_err(|error| FileError::content(file, error.to_string())),
+        Some(found) => found.map_err(|error| FileError::not_pem(file, &error)),
         None => Err(FileError::content(file, missing(text, "key"))),
     }
 }

@@ -52,7 +52,7 @@ impl List {
             .map_err(|error| FileError::Unreadable { file: file.display().to_string(), error })?;
         let found: Result<Vec<_>, _> =
             CertificateRevocationListDer::pem_slice_iter(&text).collect();
-        let found = found.map_err(|error| FileError::content(file, error.to_string()))?;
+        let found = found.map_err(|error| FileError::not_pem(file, &error))?;
         if found.is_empty() {
             let flaw = "found no revocation list, allowed: X509 CRL in PEM";
             return Err(FileError::content(file, flaw));
