@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -15,6 +16,7 @@ from holdfast import SyncClient, _core
 from holdfast.cli.signals import (
     Interrupted,
     Signals,
+    ended_by_ctrl_c,
     ending_signals,
     interruptions,
     keep_hangups,
@@ -179,6 +181,56 @@ def heard() -> Iterator[None]:
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
+
+
+INTERRUPTED_IMPORT = """
+import importlib.abc, signal, sys
+
+class Interrupts(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == sys.argv[1]:
+            signal.raise_signal(signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.{handler})
+sys.meta_path.insert(0, Interrupts())
+from holdfast.cli import main
+main(["check", "--help"])
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no exit codes of signals")
+@pytest.mark.parametrize("module", ["click", "holdfast.cli.appliance.check"])
+@pytest.mark.parametrize(
+    ("handler", "code"), [("default_int_handler", -signal.SIGINT), ("SIG_IGN", 0)]
+)
+def test_ctrl_c_while_a_command_is_imported_ends_it_without_a_traceback(
+    module: str, handler: str, code: int
+) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_IMPORT.format(handler=handler), module],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=wire.DEADLINE,
+    )
+    assert (ended.returncode, ended.stderr) == (code, "")
+
+
+@pytest.mark.usefixtures("heard")
+def test_ctrl_c_is_an_exception_again_after_an_import() -> None:
+    with ended_by_ctrl_c():
+        assert signal.getsignal(signal.SIGINT) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
+    found: list[Any] = []
+
+    def in_another_thread() -> None:
+        with ended_by_ctrl_c():
+            found.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=in_another_thread)
+    thread.start()
+    thread.join()
+    assert found == [signal.default_int_handler]
 
 
 @pytest.mark.usefixtures("heard")

@@ -6,22 +6,24 @@ Commands contain no logic that another caller could need.
 
 from __future__ import annotations
 
-import contextlib
-import importlib
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from holdfast.cli.signals import ended_by_ctrl_c, keep_hangups
 
-import click
+with ended_by_ctrl_c():
+    import contextlib
+    import importlib
+    from pathlib import Path
+    from typing import TYPE_CHECKING, Any
 
-from holdfast import __version__
-from holdfast.cli import answers, standard_output
-from holdfast.cli.exit_codes import ExitCode, fail
-from holdfast.cli.old_spellings import OLD_NAMES, hint, renewed
-from holdfast.cli.signals import keep_hangups
-from holdfast.runtime import extras
-from holdfast.runtime.interpreter import spare_memory
-from holdfast.runtime.suggestion import alike
-from holdfast.runtime.text import either, sentence
+    import click
+
+    from holdfast import __version__
+    from holdfast.cli import answers, standard_output
+    from holdfast.cli.exit_codes import ExitCode, fail
+    from holdfast.cli.old_spellings import OLD_NAMES, hint, renewed
+    from holdfast.runtime import extras
+    from holdfast.runtime.interpreter import spare_memory
+    from holdfast.runtime.suggestion import alike
+    from holdfast.runtime.text import either, sentence
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -85,7 +87,8 @@ COMMANDS = {
 
 def _imported(place: str) -> click.Command:
     module, _, name = place.partition(":")
-    command: click.Command = getattr(importlib.import_module(f"{__name__}.{module}"), name)
+    with ended_by_ctrl_c():
+        command: click.Command = getattr(importlib.import_module(f"{__name__}.{module}"), name)
     return command
 
 

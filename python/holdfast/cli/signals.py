@@ -53,6 +53,27 @@ def keep_hangups() -> None:
         signal.signal(hangup, lambda number, _frame: _early_hangups.append(number))
 
 
+@contextmanager
+def ended_by_ctrl_c() -> Iterator[None]:
+    """Lets Ctrl-C end the process at once, as a stop does, while modules are imported.
+
+    Nothing has begun yet. `KeyboardInterrupt` in the middle of an import shows a traceback, may
+    become a `RuntimeError`, and is lost in a destructor.
+    """
+    number, usual = signal.SIGINT, signal.default_int_handler
+    try:
+        is_usual = signal.getsignal(number) == usual
+        if is_usual:
+            signal.signal(number, signal.SIG_DFL)
+    except ValueError:  # Only the main thread may set it.
+        is_usual = False
+    try:
+        yield
+    finally:
+        if is_usual:
+            signal.signal(number, usual)
+
+
 SIGNAL_INTERVAL_S = 0.2
 """A command that waits for something else looks for signals this often."""
 
