@@ -216,6 +216,26 @@ def test_a_deleted_file_begins_with_a_line_that_says_so(log: Path) -> None:
     assert verify([log]).breaks == {"deleted": 1}
 
 
+@pytest.mark.parametrize(("is_copied", "reason"), [(False, "deleted"), (True, "changed")])
+def test_a_file_that_another_one_replaces_says_whether_it_still_exists(
+    log: Path, *, is_copied: bool, reason: str
+) -> None:
+    audit = opened(log)
+    audit.write(number=1)
+    earlier = log.with_name("earlier.log")
+    earlier.write_bytes(log.read_bytes())
+    audit.write(number=2)
+    if is_copied:
+        log.write_bytes(earlier.read_bytes())
+    else:
+        earlier.replace(log)
+    audit.write(number=3)
+    audit.close()
+    assert (numbers(log), reasons(log)) == ([1, 3], ["new", reason])
+    found = verify([log])
+    assert (found.error, found.breaks) == (None, {reason: 1})
+
+
 @pytest.mark.parametrize("content", [b"", b"else\n", b'{"half'])
 def test_a_file_whose_size_others_change_says_so(log: Path, content: bytes) -> None:
     audit = opened(log)

@@ -21,8 +21,9 @@ BREAK = "chain"
 """The event of a line that says why the chain does not simply go on. Its `reason` is one of:
 `new` (no line before is known), `missing` (the file was missing or empty at the start), `torn` (the
 last line was incomplete; `after` is the digest of the line before that one), `unchained` (the last
-line had no place in a chain), `deleted` (the file was deleted while it was written), `changed`
-(something else changed the size of the file, or put another one in its place)."""
+line had no place in a chain), `deleted` (the file was deleted while it was written, also by
+renaming another one into its place), `changed` (something else changed the size of the file, or
+moved it away and put another one in its place)."""
 
 
 encoded = msgspec.json.Encoder().encode
