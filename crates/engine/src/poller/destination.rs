@@ -1,6 +1,7 @@
 //! What is read from a device, and where it goes.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
 use holdfast_memory::{Area, Memory, Write};
@@ -52,8 +53,45 @@ impl Destination {
         Write { area, address, count: count as usize, bytes }
     }
 
+    /// What tells it and `count` items apart from other ranges of memories.
+    pub(super) fn range(&self, count: u32) -> (*const Memory, Area, u16, u32) {
+        (Arc::as_ptr(&self.memory), self.area, self.address, count)
+    }
+
     /// Whether `count` items fit.
     pub(super) fn holds(&self, count: u32) -> bool {
         self.memory.span(self.area).holds(self.address, count as usize)
+    }
+}
+
+/// Whether memory has stored or refused what was read into a range. A journal reports it from any thread, often
+/// after the poll has ended, so a poll is judged by the newest outcome that is known.
+#[derive(Debug, Default)]
+pub(super) struct WriteOutcomes {
+    /// The number of the last write.
+    begun: AtomicU64,
+    /// Twice the number of the newest write with an outcome, plus 1 if it was refused.
+    newest: AtomicU64,
+}
+
+impl WriteOutcomes {
+    /// Returns the number of a new write.
+    pub(super) fn begin(&self) -> u64 {
+        self.begun.fetch_add(1, Ordering::Relaxed) + 1
+    }
+
+    /// Records the outcome of a write. It is ignored if that of a later one is known: a journal that takes no
+    /// more writes refuses them at once, while earlier ones are still being stored.
+    pub(super) fn end(&self, number: u64, is_stored: bool) {
+        self.newest.fetch_max(number * 2 + u64::from(!is_stored), Ordering::Relaxed);
+    }
+
+    /// Ignores what becomes of the writes so far.
+    pub(super) fn forget(&self) {
+        self.end(self.begin(), true);
+    }
+
+    pub(super) fn is_refused(&self) -> bool {
+        self.newest.load(Ordering::Relaxed) % 2 == 1
     }
 }

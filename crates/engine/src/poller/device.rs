@@ -25,7 +25,7 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
 use super::cost::Samples;
-use super::destination::{ReadSettings, mirrors};
+use super::destination::{ReadSettings, WriteOutcomes, mirrors};
 use super::forwarding::{Forward, ForwardSettings};
 use super::panic_guard::{Panicked, catch};
 use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
@@ -110,6 +110,8 @@ pub(super) struct Device {
     pub(super) fields: Vec<Field>,
     /// For each field, the index of its read, and its offset in it, in items.
     parts: Vec<(usize, u32)>,
+    /// For each read, if it goes into a memory.
+    outcomes: Vec<Option<Arc<WriteOutcomes>>>,
     reported_as: Arc<str>,
     learned: RefCell<Learned>,
     /// `None` while the device has no plan. The state has the error.
@@ -221,9 +223,11 @@ impl Device {
         (link, turn): (Rc<Link>, Rc<Turn>),
         forwards: Vec<Rc<Forward>>,
     ) -> Device {
+        let outcomes = settings.reads.iter().map(|read| read.into.as_ref().map(|_| Arc::default()));
         let device = Device {
             fields,
             parts,
+            outcomes: outcomes.collect(),
             reported_as: settings.reported_as.as_ref().unwrap_or(&settings.name).as_str().into(),
             learned: RefCell::default(),
             plan: RefCell::default(),
@@ -360,6 +364,8 @@ impl Device {
         // The device before this one may have stood by, with another fence.
         if self.state.stands_by() {
             self.state.set_standby(false);
+            // What was refused under a former lease fails no poll of this one.
+            self.outcomes.iter().flatten().for_each(|outcomes| outcomes.forget());
             self.poll_pause.end();
             self.schedule.begin_now();
         }
@@ -391,6 +397,7 @@ impl Device {
 
     /// Takes over the state of the device before it.
     fn follow(&mut self, before: Device) {
+        self.keep_outcomes(&before);
         let (old, new) = (&before.settings, &self.settings);
         if before.has_other_source(self) {
             return self.schedule.begin_now();
@@ -405,6 +412,21 @@ impl Device {
             self.learned.replace(before.learned.take());
             self.learned().keep(&self.fields);
             self.draw_plan();
+        }
+    }
+
+    /// A range whose last values were refused before a reload is still without them.
+    fn keep_outcomes(&mut self, before: &Device) {
+        let of = |device: &Device| {
+            let reads = device.settings.reads.iter();
+            let ranges = reads.map(|read| read.into.as_ref().map(|into| into.range(read.count)));
+            ranges.collect::<Vec<_>>()
+        };
+        let known: HashMap<_, _> = of(before).into_iter().zip(&before.outcomes).collect();
+        for (range, outcomes) in of(self).iter().zip(&mut self.outcomes) {
+            if let Some(known) = known.get(range) {
+                outcomes.clone_from(known);
+            }
         }
     }
 
@@ -509,8 +531,8 @@ impl Device {
             self.link.release();
         }
         self.poll_pause.note(fault.is_some() && !answered);
-        let unstored = self.state.take_unstored().then_some(Fault::Unstored);
-        match fault.or(unstored) {
+        let is_unstored = self.outcomes.iter().flatten().any(|outcomes| outcomes.is_refused());
+        match fault.or(is_unstored.then_some(Fault::Unstored)) {
             None => self.state.good(),
             Some(fault) => self.state.bad(fault),
         }
@@ -663,21 +685,27 @@ impl Device {
     /// `since` is when the values arrived, as [`ReadSettings::now`].
     fn hand_on(&self, index: usize, bytes: &[u8], since: Option<Duration>) {
         let read = &self.settings.reads[index];
-        let (mut area, mut address, mut stored) = (read.area, read.address, Ok(()));
-        if let Some(into) = &read.into {
+        let (mut area, mut address) = (read.area, read.address);
+        if let (Some(into), Some(outcomes)) = (&read.into, &self.outcomes[index]) {
             (area, address) = (into.area, into.address);
-            let age = into.age.clone().zip(since);
-            // Called after the write, so that the values before it are never taken for fresh.
-            let renew = move || age.into_iter().for_each(|(age, since)| age.renew_since(since));
+            let (age, items) = (into.age.clone().zip(since), read.count);
+            let (state, outcomes) = (Arc::clone(&self.state), Arc::clone(outcomes));
+            let number = outcomes.begin();
+            let ended = move |is_stored| {
+                outcomes.end(number, is_stored);
+                if !is_stored {
+                    return state.counters.unstored.add();
+                }
+                // After the write, so that the values before it are never taken for fresh.
+                age.iter().for_each(|(age, since)| age.renew_since(*since));
+                state.count_read(items);
+            };
             let write = into.writing(read.count, bytes);
-            stored = self.store(&into.memory, Access::Mirror, write, renew);
-        }
-        match stored {
-            Ok(()) => {
-                self.state.counters.reads.add();
-                self.state.counters.values.add_many(u64::from(read.count));
+            if self.store(&into.memory, Access::Mirror, write, ended.clone()).is_err() {
+                ended(false);
             }
-            Err(_) => self.state.count_unstored(true),
+        } else {
+            self.state.count_read(read.count);
         }
         if !read.forward {
             return;
@@ -689,24 +717,20 @@ impl Device {
         }
     }
 
-    /// Writes what was read from the device, or its status block. This doesn't wait for the journal of a memory, because the other
-    /// devices of the thread would wait too: what the journal refuses is counted later. Calls `stored` once memory
-    /// has the values.
+    /// Writes what was read from the device, or its status block. This doesn't wait for the journal of a memory,
+    /// because the other devices of the thread would wait too. Unless the write is refused at once, `ended` is
+    /// called with whether memory has the values.
     fn store(
         &self,
         memory: &Memory,
         access: Access,
         write: Write<'_>,
-        stored: impl FnOnce() + Send + 'static,
+        ended: impl FnOnce(bool) + Send + 'static,
     ) -> Result<(), Refusal> {
         if !memory.has_journal() {
-            return memory.write(access, write).map(|()| stored());
+            return memory.write(access, write).map(|()| ended(true));
         }
-        let (state, is_read) = (Arc::clone(&self.state), matches!(access, Access::Mirror));
-        let done = Box::new(move |outcome: Outcome| match outcome {
-            Ok(_) => stored(),
-            Err(_) => state.count_unstored(is_read),
-        });
+        let done = Box::new(|outcome: Outcome| ended(outcome.is_ok()));
         submit_under(self.settings.fence.as_ref(), memory, access, write, done)
     }
 
@@ -720,11 +744,18 @@ impl Device {
         let (status, without_lease) = (self.state.status(), self.is_without_lease());
         if let Some(to) = &self.settings.status
             && !(without_lease && to.memory.is_replicated())
-            && status
-                .write_by(to, |write| self.store(&to.memory, Access::Ingest, write, || ()))
-                .is_err()
         {
-            self.state.count_unstored(false);
+            let state = Arc::clone(&self.state);
+            let ended = move |is_stored: bool| {
+                if !is_stored {
+                    state.counters.unstored.add();
+                }
+            };
+            let written = status
+                .write_by(to, |write| self.store(&to.memory, Access::Ingest, write, ended.clone()));
+            if written.is_err() {
+                ended(false);
+            }
         }
         if without_lease {
             return;

@@ -29,8 +29,6 @@ pub struct DeviceState {
     plan_error: Mutex<Option<String>>,
     /// Why the last request that failed did.
     error: Mutex<Option<Arc<ClientError>>>,
-    /// Whether a memory has refused something since the last poll.
-    unstored: AtomicBool,
     /// Whether a task of the device has panicked since the device was created or replaced.
     broken: AtomicBool,
     standby: AtomicBool,
@@ -125,15 +123,10 @@ impl DeviceState {
         }
     }
 
-    /// Counts a refusal of memory. If it is of a read, the poll counts as failed, or the next one.
-    pub(super) fn count_unstored(&self, is_read: bool) {
-        self.counters.unstored.add();
-        self.unstored.fetch_or(is_read, Ordering::Relaxed);
-    }
-
-    /// Whether a memory has refused a read since the last call.
-    pub(super) fn take_unstored(&self) -> bool {
-        self.unstored.swap(false, Ordering::Relaxed)
+    /// Counts a complete read of so many items that was stored, or has no destination.
+    pub(super) fn count_read(&self, items: u32) {
+        self.counters.reads.add();
+        self.counters.values.add_many(items.into());
     }
 
     /// What the connection to its address has received without a request, or late. Devices at one address
@@ -151,7 +144,6 @@ impl DeviceState {
     pub(super) fn set_standby(&self, standby: bool) {
         if !standby {
             self.health.store(Health::Unknown.code(), Ordering::Relaxed);
-            self.take_unstored();
             self.times().error_since = Some(Instant::now());
         }
         self.standby.store(standby, Ordering::Relaxed);

@@ -249,48 +249,175 @@ fn a_status_block_that_memory_refuses_is_counted_and_fails_no_poll() {
     });
 }
 
+/// Carries out or refuses steps when a test does.
+#[derive(Default)]
+struct Late {
+    memory: Weak<Memory>,
+    steps: Mutex<Vec<(Step, Done)>>,
+}
+
+impl std::fmt::Debug for Late {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.write_str("Late")
+    }
+}
+
+impl Journal for Late {
+    fn submit(&self, step: Step, done: Done) {
+        self.steps.lock().unwrap().push((step, done));
+    }
+}
+
+impl Late {
+    fn new(memory: &Arc<Memory>) -> Arc<Late> {
+        let late = Arc::new(Late { memory: Arc::downgrade(memory), ..Late::default() });
+        memory.keep_in(Arc::clone(&late) as Arc<dyn Journal>, 0);
+        late
+    }
+
+    fn take(&self) -> Vec<(Step, Done)> {
+        std::mem::take(&mut self.steps.lock().unwrap())
+    }
+
+    fn store(&self) {
+        for (step, done) in self.take() {
+            done(step.carry_out(&[self.memory.upgrade().unwrap()]));
+        }
+    }
+
+    fn refuse(&self) {
+        refuse(self.take());
+    }
+}
+
+fn refuse(steps: Vec<(Step, Done)>) {
+    for (_, done) in steps {
+        done(Err(Refused { index: 0, refusal: Refusal::Unavailable }));
+    }
+}
+
+async fn polled(device: &Device) -> Health {
+    device.poll(Instant::now()).await;
+    device.state.health()
+}
+
 #[test]
 fn a_poll_is_in_error_for_a_late_refusal_of_its_own_lease_only() {
-    /// Answers when the test does.
-    #[derive(Default)]
-    struct Late(Mutex<Vec<Done>>);
-
-    impl std::fmt::Debug for Late {
-        fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-            formatter.write_str("Late")
-        }
-    }
-
-    impl Journal for Late {
-        fn submit(&self, _: Step, done: Done) {
-            self.0.lock().unwrap().push(done);
-        }
-    }
-
     with_device(async |endpoint| {
-        let (journal, memory) = (Arc::new(Late::default()), memory());
-        memory.keep_in(Arc::clone(&journal) as Arc<dyn Journal>, 0);
-        let refuse = || {
-            for done in journal.0.lock().unwrap().drain(..) {
-                done(Err(Refused { index: 0, refusal: Refusal::Unavailable }));
-            }
-        };
+        let memory = memory();
+        let journal = Late::new(&memory);
+        let fence = Arc::new(Fence::new(1));
+        let open = || fence.open(std::time::Instant::now() + TIMEOUT, Term::default(), TIMEOUT);
         let status = StatusSettings { memory: Arc::clone(&memory), block: block(AREA, 1) };
-        let settings = settings(endpoint, &memory, 0);
-        let (device, state, _) = device(DeviceSettings { status: Some(status), ..settings });
-        let polled = async || {
-            device.poll(Instant::now()).await;
-            state.health()
+        let settings = DeviceSettings {
+            status: Some(status),
+            fence: Some(Arc::clone(&fence)),
+            ..settings(endpoint, &memory, 0)
         };
+        let (device, state, _) = device(settings);
+        open();
         device.publish_status();
-        refuse();
-        assert_eq!((polled().await, state.counters.unstored.get()), (Health::Ok, 1));
-        refuse();
-        assert_eq!((polled().await, state.counters.unstored.get()), (Health::Error, 2));
-        refuse();
-        state.set_standby(true);
-        state.set_standby(false);
-        assert_eq!((polled().await, state.counters.unstored.get()), (Health::Ok, 3));
+        journal.refuse();
+        assert_eq!((polled(&device).await, state.counters.unstored.get()), (Health::Ok, 1));
+        journal.refuse();
+        assert_eq!((polled(&device).await, state.counters.unstored.get()), (Health::Error, 2));
+        fence.end();
+        let inbox = Inbox::default();
+        tokio::select! {
+            biased;
+            _ = device.stand_by(&inbox) => panic!("it stands by until the fence opens"),
+            () = tokio::task::yield_now() => {}
+        }
+        open();
+        assert!(device.stand_by(&inbox).await.is_none());
+        // The last read under the former lease, and two status blocks.
+        journal.refuse();
+        assert_eq!((polled(&device).await, state.counters.unstored.get()), (Health::Ok, 4));
+    });
+}
+
+#[test]
+fn polls_are_in_error_until_memory_has_stored_a_read() {
+    with_device(async |endpoint| {
+        let memory = memory();
+        let journal = Late::new(&memory);
+        let (device, state, _) = device(settings(endpoint, &memory, 0));
+        let counters = &state.counters;
+        let stored = || (counters.good_polls.get(), counters.reads.get(), counters.values.get());
+        assert_eq!(polled(&device).await, Health::Ok, "nothing is known yet");
+        polled(&device).await;
+        journal.refuse();
+        let before = stored();
+        for failures in 1..4 {
+            // Its own outcome is not known yet.
+            assert_eq!(polled(&device).await, Health::Error);
+            assert_eq!((state.failures(), state.last_error()), (failures, 0x8006));
+        }
+        assert_eq!((stored(), registers(&memory)), (before, vec![0; 80]));
+        assert_eq!((before, counters.unstored.get()), ((2, 0, 0), 2));
+        journal.store();
+        assert_eq!((polled(&device).await, state.failures()), (Health::Ok, 0));
+        assert_eq!(stored(), (3, 3, 12));
+    });
+}
+
+#[test]
+fn a_refusal_counts_until_a_later_read_is_stored() {
+    with_device(async |endpoint| {
+        let memory = memory();
+        let journal = Late::new(&memory);
+        let (device, ..) = device(settings(endpoint, &memory, 0));
+        polled(&device).await;
+        let earlier = journal.take();
+        polled(&device).await;
+        journal.refuse();
+        journal.steps.lock().unwrap().extend(earlier);
+        journal.store();
+        assert_eq!(polled(&device).await, Health::Error);
+        journal.store();
+        assert_eq!(polled(&device).await, Health::Ok);
+    });
+}
+
+#[test]
+fn each_memory_that_refuses_a_read_fails_the_poll() {
+    with_device(async |endpoint| {
+        let (full, good) = (memory(), memory());
+        let (refusing, storing) = (Late::new(&full), Late::new(&good));
+        let mut settings = settings(endpoint.clone(), &full, 0);
+        settings.reads.extend(self::settings(endpoint, &good, 0).reads);
+        let (device, state, _) = device(settings);
+        polled(&device).await;
+        refusing.refuse();
+        storing.store();
+        assert_eq!((polled(&device).await, state.counters.reads.get()), (Health::Error, 1));
+        storing.store();
+        assert_eq!((polled(&device).await, state.counters.reads.get()), (Health::Error, 2));
+        refusing.store();
+        assert_eq!(polled(&device).await, Health::Ok);
+    });
+}
+
+#[test]
+fn what_memory_has_refused_is_known_after_a_reload() {
+    with_device(async |endpoint| {
+        let memory = memory();
+        let journal = Late::new(&memory);
+        let same = settings(endpoint.clone(), &memory, 0);
+        let (mut device, state, results) = device(same.clone());
+        polled(&device).await;
+        let mut other = settings(endpoint.clone(), &memory, 20);
+        other.reads.extend(same.reads.clone());
+        let elsewhere = settings(endpoint, &memory, 30);
+        let expected = [(same, Health::Error), (other, Health::Error), (elsewhere, Health::Ok)];
+        for (settings, health) in expected {
+            let mut successor = made(settings, &state, &results);
+            successor.follow(device);
+            // What the device before it has read last.
+            journal.refuse();
+            device = successor;
+            assert_eq!(polled(&device).await, health);
+        }
     });
 }
 
