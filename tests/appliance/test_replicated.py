@@ -254,6 +254,23 @@ def test_contents_survive_all_nodes(
         assert register(second, 1) == 8
 
 
+def test_a_seal_is_closed_again_unless_another_node_runs(
+    node: Callable[..., Appliance], server: NatsServer, tmp_path: Path
+) -> None:
+    sealed = {"seal": {"area": "coils", "address": 15, "mode": "once"}}
+    read, refused = "0300030001", "8306"
+    first = node("a", **sealed)
+    first.memories["plant"].write("coils", 15, [True])
+    first.stop()
+    with Appliance(config(tmp_path, [server.url], "a", **sealed)) as alone:
+        assert ask(alone, read) == refused
+        assert alone.memories["plant"].read("coils", 15, 1) == [False]
+        alone.memories["plant"].write("coils", 15, [True])
+        node("b", **sealed)
+    again = node("a", **sealed)
+    assert ask(again, read) == "03020000"
+
+
 def test_a_node_that_keeps_its_memory_does_not_go_back_with_its_servers(
     tmp_path: Path, server: NatsServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1119,7 +1119,7 @@ fn a_message_of_a_newer_version_stops_a_node() {
     until("the node stops", || node.failure().is_some());
     let error = node.failure().unwrap();
     assert_eq!(error.kind(), "version");
-    let expected = "a message of the log has version 9, supported is 3: update this node";
+    let expected = "a message of the log has version 9, supported is 4: update this node";
     assert_eq!(error.to_string(), expected);
     assert_eq!(node.read(0), Err(Refusal::Differs));
 }

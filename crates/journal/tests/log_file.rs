@@ -302,7 +302,7 @@ fn a_note_that_does_not_fit_is_refused() {
 }
 
 #[test]
-fn an_open_seal_stays_open_in_a_log() {
+fn an_open_seal_stays_open_in_a_log_while_another_node_runs() {
     let (server, folder) = (Server::new(), Folder::new());
     let path = file_in(&folder);
     let sealed = || {
@@ -312,17 +312,29 @@ fn an_open_seal_stays_open_in_a_log() {
             .with(nodes::REGISTERS, Span::new(0, 8).unwrap());
         Arc::new(Memory::new(layout, Some(gate)).unwrap())
     };
-    let node = KeptNode::with(sealed(), &server, &path, |_| {});
+    let change = |settings: &mut Settings| settings.answer_timeout = nodes::DEADLINE * 10;
+    let kept = || KeptNode::with(sealed(), &server, &path, change);
+    let other = Node::with(sealed(), &[&server], "b", change);
+    let node = kept();
     node.start();
+    other.start();
     let open = holdfast_memory::Write { area: nodes::GATE, address: 3, count: 1, bytes: &[1] };
     node.node.memory.write(holdfast_memory::Access::Ingest, open).unwrap();
     assert!(!node.node.memory.sealed());
     node.stop();
     let before: Vec<Contents> = Memory::contents(std::slice::from_ref(&node.node.memory));
     drop(node);
-    let node = KeptNode::with(sealed(), &server, &path, |_| {});
+    let node = kept();
     node.start();
     assert_eq!(Memory::contents(std::slice::from_ref(&node.node.memory)), before);
+    node.stop();
+    other.log.stop();
+    drop(node);
+    let node = KeptNode::with(sealed(), &server, &path, |settings| {
+        settings.answer_timeout = Duration::from_millis(50);
+    });
+    node.start();
+    assert!(node.node.memory.sealed());
 }
 
 /// Whoever may delete messages can shorten the log while a node is away.

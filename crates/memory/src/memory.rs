@@ -17,7 +17,7 @@ use crate::bits;
 use crate::error::LayoutError;
 use crate::mirrored::{Mirrored, MirroredRanges};
 use crate::operation::{Access, Read, Write};
-use crate::seal::Gate;
+use crate::seal::{Gate, GateMode};
 use crate::step::Journal;
 use crate::write_queue::{Observers, WriteQueue};
 
@@ -269,6 +269,26 @@ impl Memory {
     /// How many times the seal opened, and how many times it closed again.
     pub fn seal_changes(&self) -> (u64, u64) {
         self.shared().seal_changes
+    }
+
+    /// Whether the memory has a seal that opens once, and it is open.
+    pub fn is_open_once(&self) -> bool {
+        self.gate.is_some_and(|gate| gate.mode == GateMode::Once) && !self.sealed()
+    }
+
+    /// Closes a seal that opens once, as a restart does: its gate bit becomes 0. Returns whether it was open.
+    pub fn close_seal(&self) -> bool {
+        let Some(Gate { area, address, mode: GateMode::Once }) = self.gate else { return false };
+        let mut content = self.exclusive();
+        if content.sealed() {
+            return false;
+        }
+        let closed = Write { area, address, count: 1, bytes: &[0] };
+        self.copy_in(&mut content, &closed);
+        content.written(Access::Ingest, [&closed]);
+        content.seal(true);
+        content.seal_changes.1 += 1;
+        true
     }
 
     /// Returns a queue of all writes from now on, or of those of clients. It is bounded, and ends

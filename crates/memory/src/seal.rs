@@ -8,7 +8,7 @@ use crate::operation::{Access, Write};
 /// When the gate bit opens the seal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GateMode {
-    /// The first ingest that leaves the gate bit at 1 opens the memory permanently.
+    /// The first ingest that leaves the gate bit at 1 opens the memory until a restart.
     Once,
     /// The memory is sealed whenever the gate bit is 0.
     Level,

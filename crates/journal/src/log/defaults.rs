@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::parts::comparer::DIGEST_EVERY;
+use super::parts::continuity::ANSWER_TIMEOUT;
 use super::parts::snapshotter::{SNAPSHOT_BYTES, SNAPSHOT_STEPS};
 use super::parts::wrong_contents::REJOIN_AFTER;
 use super::settings::{Login, Servers, Settings};
@@ -36,6 +37,7 @@ impl Settings {
             rejoin_after: Some(REJOIN_AFTER),
             memory_file: None,
             max_cut_off: MAX_CUT_OFF,
+            answer_timeout: ANSWER_TIMEOUT,
             answers_early: false,
         }
     }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use async_nats::jetstream;
 use futures_util::StreamExt;
-use holdfast_memory::{Memory, Outcome, Refusal, Step};
+use holdfast_memory::{Access, Action, Gate, Memory, Outcome, Refusal, Step, StepWrite};
 
 use super::error::{End, LogError, missing};
 use super::layout::fingerprint;
@@ -37,6 +37,7 @@ pub struct Record {
     pub stored: i64,
     /// `None` if it is not of a node. Then it has no steps.
     pub origin: Option<Origin>,
+    /// Seals that it has closed are writes of their gate bits.
     pub steps: Vec<Step>,
     /// Why steps were refused, by their index.
     pub refusals: Vec<Option<Refusal>>,
@@ -157,6 +158,14 @@ impl LogReader {
 }
 
 impl Reading {
+    /// What closing a seal has written, as a step.
+    fn closed_gate(&self, member: u16) -> Option<Step> {
+        let Gate { area, address, .. } = self.state.members.get(usize::from(member))?.gate()?;
+        let write = StepWrite { member, area, address, count: 1, bytes: vec![0] };
+        let action = Action::Write(vec![write]);
+        Some(Step { access: Access::Ingest, tenure: None, action })
+    }
+
     /// `None` at a message that was stored after the end.
     async fn next(&mut self, until: Until) -> Result<Option<Record>, End> {
         let next = self.state.place.sequence + 1;
@@ -177,14 +186,15 @@ impl Reading {
             // Also a message that was applied before is shown, with its steps.
             let decoded = message::decode(&payload, &self.state.members).ok();
             let applied = self.state.apply(place, &payload, |_| None)?;
-            let (fresh, outcomes) = match applied {
-                Applied::Fresh { outcomes, .. } => (true, outcomes),
-                Applied::Stale(_) | Applied::Ignored(_) => (false, Vec::new()),
+            let (fresh, outcomes, sealed) = match applied {
+                Applied::Fresh { outcomes, sealed, .. } => (true, outcomes, sealed),
+                Applied::Stale(_) | Applied::Ignored(_) => (false, Vec::new(), Vec::new()),
             };
             let refusal = |outcome: Outcome| outcome.err().map(|refused| refused.refusal);
             let refusals = outcomes.into_iter().map(refusal).collect();
-            let (origin, steps) =
+            let (origin, mut steps) =
                 decoded.map(|message| (Some(message.origin), message.steps)).unwrap_or_default();
+            steps.extend(sealed.into_iter().filter_map(|member| self.closed_gate(member)));
             let Place { sequence, stored } = place;
             return Ok(Some(Record { sequence, stored, origin, steps, refusals, fresh }));
         }

@@ -12,8 +12,8 @@
 //! ```
 //!
 //! In `parts`, `thread.rs` runs sessions, and `session.rs` joins the parts of a node (`node.rs`): `applier.rs`,
-//! `sender.rs`, `snapshotter.rs`, `comparer.rs`, and `wrong_contents.rs` for a node whose contents were
-//! wrong. `session_start.rs` is for the beginning of a session, and `applied_file.rs` for a node with a
+//! `sender.rs`, `snapshotter.rs`, `comparer.rs`, `continuity.rs` for seals after a restart, and
+//! `wrong_contents.rs` for a node whose contents were wrong. `session_start.rs` is for the beginning of a session, and `applied_file.rs` for a node with a
 //! file. `stream/messages.rs` reads the stream.
 
 mod clock;

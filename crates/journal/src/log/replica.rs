@@ -42,7 +42,11 @@ impl Replica {
 
 /// A message, decoded and encoded again. `None`: these bytes are not a message for these memories.
 pub fn again(payload: &[u8], members: &[Arc<Memory>]) -> Option<Vec<u8>> {
-    let Message { origin, compares, deadline, steps } = message::decode(payload, members).ok()?;
+    let Message { origin, compares, deadline, notice, steps } =
+        message::decode(payload, members).ok()?;
+    if let Some(notice) = notice {
+        return Some(message::encode_notice(&origin, compares, notice).to_vec());
+    }
     let encoded = |step: &Step| {
         let mut bytes = Vec::new();
         encoding::encode(step, &mut bytes);

@@ -70,6 +70,9 @@ pub struct Settings {
     pub memory_file: Option<String>,
     /// For so long, a server may know less than this node: it may be cut off from the other servers.
     pub max_cut_off: Duration,
+    /// How long a node that starts waits for an answer of another node before seals that open once are closed.
+    #[doc(hidden)]
+    pub answer_timeout: Duration,
     /// Writes are answered when they are sent. Tests use it to show what then goes wrong.
     #[doc(hidden)]
     pub answers_early: bool,

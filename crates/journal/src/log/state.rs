@@ -17,7 +17,7 @@ use super::late_messages::is_late;
 use super::lease_terms::LeaseTerms;
 use super::settings::is_word;
 use crate::log::stream::message::{
-    self, MAX_NODES, Message, MessageError, Origin, VERSION, WITH_LEASES, WITHOUT_LEASES,
+    self, MAX_NODES, Message, MessageError, Notice, Origin, VERSION, WITH_LEASES, WITHOUT_LEASES,
 };
 
 /// An encoded state begins with it.
@@ -58,7 +58,10 @@ pub(super) enum Applied {
     Fresh {
         origin: Origin,
         compares: bool,
+        notice: Option<Notice>,
         outcomes: Vec<Outcome>,
+        /// The memories whose seal it has closed.
+        sealed: Vec<u16>,
     },
     /// It was applied before, or a later one of the same node was.
     Stale(Origin),
@@ -81,6 +84,16 @@ impl State {
     /// Whether a message of this node was applied.
     pub(super) fn knows(&self, node: &str) -> bool {
         self.origins.contains_key(node)
+    }
+
+    /// Whether a node other than this one has ever sent a message.
+    pub(super) fn knows_others(&self, node: &str) -> bool {
+        self.origins.keys().any(|known| known != node)
+    }
+
+    /// Whether a seal that opens once is open.
+    pub(super) fn has_open_seal(&self) -> bool {
+        self.members.iter().any(|memory| memory.is_open_once())
     }
 
     /// The last start of a node that was applied.
@@ -106,7 +119,7 @@ impl State {
         age: impl FnOnce(&Origin) -> Option<Duration>,
     ) -> Result<Applied, LogError> {
         debug_assert_eq!(place.sequence, self.place.sequence + 1, "messages are applied in order");
-        let Message { origin, compares, deadline, steps } =
+        let Message { origin, compares, deadline, notice, steps } =
             match message::decode(payload, &self.members) {
                 Ok(message) => message,
                 Err(MessageError::Version(found)) => {
@@ -142,7 +155,20 @@ impl State {
             step.carry_out_late(&self.members, age).map(at)
         };
         let outcomes = steps.iter().map(carried_out).collect();
-        Ok(Applied::Fresh { origin, compares, outcomes })
+        let sealed = match notice {
+            // What came between may be an answer, or seals that were closed and opened again.
+            Some(Notice::Closes { behind }) if behind.checked_add(1) == Some(place.sequence) => {
+                self.close_seals()
+            }
+            _ => Vec::new(),
+        };
+        Ok(Applied::Fresh { origin, compares, notice, outcomes, sealed })
+    }
+
+    /// Closes the seals that open once. Returns whose were open.
+    fn close_seals(&self) -> Vec<u16> {
+        let numbered = (0..).zip(&self.members);
+        numbered.filter(|(_, memory)| memory.close_seal()).map(|(member, _)| member).collect()
     }
 
     /// The version of the encoded state.
@@ -268,7 +294,9 @@ fn contents(bytes: &mut &[u8], memory: &Memory) -> Option<Contents> {
 
 #[cfg(test)]
 mod tests {
-    use holdfast_memory::{Access, Action, Area, Layout, Span, StepWrite, Tenure, Term};
+    use holdfast_memory::{
+        Access, Action, Area, Gate, GateMode, Layout, Span, StepWrite, Tenure, Term, Write,
+    };
 
     use super::*;
     use crate::encoding;
@@ -340,6 +368,39 @@ mod tests {
         assert_eq!(apply(2, 501, Some(500), 2), (Err(Refusal::NotConfirmed), 1));
         assert_eq!(apply(3, 502, None, 3), (Ok(()), 3), "of an older node");
         assert_eq!(state.last_counter("a", 1), 3);
+    }
+
+    #[test]
+    fn seals_are_closed_only_directly_behind_the_message_that_the_node_has_applied_last() {
+        let gate = |mode| Gate { area: Area::Coils, address: 3, mode };
+        let layout = Layout::default().with(Area::Coils, Span::new(0, 8).unwrap());
+        let gates = [Some(gate(GateMode::Once)), Some(gate(GateMode::Level)), None];
+        let members = gates.map(|gate| Arc::new(Memory::new(layout.clone(), gate).unwrap()));
+        for memory in &members {
+            let write = Write { area: Area::Coils, address: 0, count: 8, bytes: &[0xff] };
+            memory.write(Access::Ingest, write).unwrap();
+        }
+        let mut state = State::new(members.to_vec());
+        let mut apply = |sequence, notice| {
+            let origin = Origin { node: "a".to_owned(), start: 1, counter: sequence };
+            let payload = message::encode_notice(&origin, false, notice);
+            let place = Place { sequence, stored: 0 };
+            let Applied::Fresh { sealed, .. } = state.apply(place, &payload, |_| None).unwrap()
+            else {
+                panic!("it is fresh");
+            };
+            let contents = Memory::contents(&state.members);
+            (sealed, state.has_open_seal(), contents.iter().map(|of| of.areas[0][0]).collect())
+        };
+        let open = || (vec![], true, vec![0xff; 3]);
+        assert_eq!(apply(1, Notice::Asks), open());
+        assert_eq!(apply(2, Notice::Closes { behind: 0 }), open(), "something came between");
+        assert_eq!(apply(3, Notice::Closes { behind: u64::MAX }), open());
+        let closed = |sealed| (sealed, false, vec![0xf7, 0xff, 0xff]);
+        assert_eq!(apply(4, Notice::Closes { behind: 3 }), closed(vec![0]));
+        assert_eq!(apply(5, Notice::Closes { behind: 4 }), closed(vec![]), "it was closed");
+        assert!(members[0].sealed() && !members[1].sealed());
+        assert_eq!(members[0].seal_changes(), (1, 1));
     }
 
     #[test]

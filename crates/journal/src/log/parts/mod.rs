@@ -4,6 +4,7 @@ pub(crate) mod applied_file;
 pub(crate) mod applier;
 pub(crate) mod background;
 pub(crate) mod comparer;
+pub(crate) mod continuity;
 pub(crate) mod in_flight;
 pub(crate) mod node;
 pub(crate) mod sender;

@@ -7,6 +7,7 @@
 //! | [`Snapshotter`] | when a snapshot is taken and stored |
 //! | [`Comparer`] | whether digests of nodes agree |
 //! | [`Rejoin`] | whether the contents are right |
+//! | [`Continuity`] | whether seals that open once may stay open |
 //! | [`ServerLag`] | whether the servers have lost messages |
 //!
 //! The parts do not know each other. A session passes on what one of them finds out.
@@ -19,6 +20,7 @@ use holdfast_memory::Memory;
 use crate::log::error::{End, LogError};
 use crate::log::parts::applier::Applier;
 use crate::log::parts::comparer::Comparer;
+use crate::log::parts::continuity::Continuity;
 use crate::log::parts::sender::Sender;
 use crate::log::parts::snapshotter::Snapshotter;
 use crate::log::parts::wrong_contents::Rejoin;
@@ -41,6 +43,7 @@ pub(in crate::log) struct Node {
     pub(in crate::log) snapshotter: Snapshotter,
     pub(in crate::log) comparer: Comparer,
     pub(in crate::log) rejoin: Rejoin,
+    pub(in crate::log) continuity: Continuity,
     pub(in crate::log) lag: ServerLag,
 }
 
@@ -51,12 +54,14 @@ impl Node {
         shared: Arc<Shared>,
         members: Vec<Arc<Memory>>,
     ) -> Node {
+        let continuity = Continuity::new(&settings, &members);
         Node {
             applier: Applier::new(&settings, &shared, members),
             sender: Sender::new(&settings, &shared),
             snapshotter: Snapshotter::new(&settings, &shared),
             comparer: Comparer::new(&settings, &shared),
             rejoin: Rejoin::new(&settings, &shared),
+            continuity,
             lag: ServerLag::new(settings.max_cut_off),
             fingerprint,
             settings,
@@ -68,6 +73,7 @@ impl Node {
         self.lag.begin_session();
         self.snapshotter.begin_session();
         self.comparer.begin_session();
+        self.continuity.begin_session();
     }
 
     /// The stream is on this many servers: it keeps those with which it was made, until an operator

@@ -20,7 +20,7 @@ use crate::log::settings::Settings;
 use crate::log::shared::Shared;
 use crate::log::state::State;
 use crate::log::status::Event;
-use crate::log::stream::message::{self, OVERHEAD_BYTES, Origin};
+use crate::log::stream::message::{self, Notice, OVERHEAD_BYTES, Origin};
 use crate::log::stream::store::{subject, unique};
 
 /// The most bytes of steps that are sent in one message with others.
@@ -225,42 +225,54 @@ impl Sender {
             let Some(until) = waiting.first().map(|first| first.until) else { break };
             let (steps, dones) =
                 waiting.into_iter().map(|waiting| (waiting.bytes, waiting.done)).unzip();
-            self.send(publisher, false, Batch { steps, dones, until }).await?;
+            self.send(publisher, Batch { steps, dones, until }).await?;
         }
         Ok(())
     }
 
-    /// Sends a message without steps: when it is applied, the contents have all that the log had when it
+    /// Sends a message without steps, with a notice if there is one: when it is applied, the contents have all that the log had when it
     /// was sent. Returns its number.
     pub(in crate::log) async fn send_probe(
         &mut self,
         publisher: &mut Publisher,
         compares: bool,
+        notice: Option<Notice>,
         until: Instant,
     ) -> Result<u64, End> {
-        let batch = Batch { steps: Vec::new(), dones: Vec::new(), until };
-        self.send(publisher, compares, batch).await
+        self.counter += 1;
+        let origin = self.origin(self.counter);
+        let payload = match notice {
+            Some(notice) => message::encode_notice(&origin, compares, notice),
+            None => message::encode(&origin, compares, None, std::iter::empty()),
+        };
+        self.publish(publisher, payload, Vec::new(), until).await
     }
 
-    async fn send(
-        &mut self,
-        publisher: &mut Publisher,
-        compares: bool,
-        batch: Batch,
-    ) -> Result<u64, End> {
+    async fn send(&mut self, publisher: &mut Publisher, batch: Batch) -> Result<u64, End> {
         let Batch { steps, mut dones, until } = batch;
         self.counter += 1;
         let origin = self.origin(self.counter);
-        let deadline = (!steps.is_empty()).then(|| self.deadline(until));
-        let payload = message::encode(&origin, compares, deadline, steps.iter().map(Vec::as_slice));
+        let deadline = Some(self.deadline(until));
+        let payload = message::encode(&origin, false, deadline, steps.iter().map(Vec::as_slice));
         if self.settings.answers_early {
             dones.drain(..).for_each(|done| done(Ok(CarriedOut::default())));
         }
+        self.publish(publisher, payload, dones, until).await
+    }
+
+    /// Publishes the next message.
+    async fn publish(
+        &mut self,
+        publisher: &mut Publisher,
+        payload: Bytes,
+        dones: Vec<Done>,
+        until: Instant,
+    ) -> Result<u64, End> {
+        let counter = self.counter;
         // Before it is published: if that fails, the next session sends it again.
-        let message = (self.counter, payload.clone());
-        self.in_flight.push(message, dones, self.shared.now(), until);
-        publisher.publish(&origin, payload).await?;
-        Ok(self.counter)
+        self.in_flight.push((counter, payload.clone()), dones, self.shared.now(), until);
+        publisher.publish(&self.origin(counter), payload).await?;
+        Ok(counter)
     }
 
     /// When the stream may store steps at the latest that are answered at `until`.

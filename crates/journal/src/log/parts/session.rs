@@ -24,6 +24,7 @@ use crate::log::settings::Settings;
 use crate::log::state::{Applied, digest_of};
 use crate::log::status::{Event, Phase};
 use crate::log::stream::connection::{Connected, REQUEST_TIMEOUT, connect};
+use crate::log::stream::message::Notice;
 use crate::log::stream::messages::Messages;
 use crate::log::stream::raw_message::Received;
 use crate::log::stream::store::{DIGEST_KEY_PREFIX, SNAPSHOT_KEY, Store, parsed};
@@ -57,6 +58,8 @@ enum CatchUp {
     Announced {
         counter: u64,
     },
+    /// It has applied all, and waits until it knows whether seals stay open.
+    Applied,
     CaughtUp,
 }
 
@@ -145,6 +148,7 @@ impl<'n> Session<'n> {
                         self.receive(&received?)?;
                     }
                     self.announce().await?;
+                    self.answer().await?;
                     self.send_waiting().await?;
                 }
                 ack = acks.next() => {
@@ -203,9 +207,26 @@ impl<'n> Session<'n> {
         node.sender.ensure_start(last_start)?;
         node.sender.resend(publisher).await?;
         let compares = !node.rejoin.contents_are_right();
-        let counter = node.sender.send_probe(publisher, compares, self.began).await?;
+        let notice = node.continuity.question();
+        let counter = node.sender.send_probe(publisher, compares, notice, self.began).await?;
         self.catch_up = CatchUp::Announced { counter };
         Ok(())
+    }
+
+    /// Answers a node that has started.
+    async fn answer(&mut self) -> Result<(), End> {
+        if self.catch_up == CatchUp::CaughtUp
+            && let Some(answer) = self.node.continuity.take_answer()
+        {
+            self.notify(Some(answer)).await?;
+        }
+        Ok(())
+    }
+
+    /// Sends a message without steps, with or without a notice. Returns its number.
+    async fn notify(&mut self, notice: Option<Notice>) -> Result<u64, End> {
+        let until = Instant::now() + self.node.settings.write_timeout;
+        self.node.sender.send_probe(&mut self.publisher, false, notice, until).await
     }
 
     async fn send_waiting(&mut self) -> Result<(), End> {
@@ -221,13 +242,17 @@ impl<'n> Session<'n> {
         self.node.snapshotter.applied(received.payload.len());
         let (mut compares, mut is_for_snapshot) = (false, false);
         match applied {
-            Applied::Fresh { origin, compares: is_asked, outcomes } => {
+            Applied::Fresh { origin, compares: is_asked, notice, outcomes, .. } => {
                 compares = is_asked;
                 let stored = received.place.stored;
-                if let Some(counter) = self.node.sender.applied(&origin, stored, outcomes)? {
+                let own = self.node.sender.applied(&origin, stored, outcomes)?;
+                if let Some(counter) = own {
                     is_for_snapshot = self.node.snapshotter.is_requested_at(counter);
                     self.applied_own(counter);
                 }
+                let Node { applier, continuity, .. } = &mut *self.node;
+                continuity.applied(applier.state(), notice, own);
+                self.finish_catch_up();
             }
             Applied::Stale(origin) => self.node.sender.check_start(&origin)?,
             Applied::Ignored(_) => {}
@@ -239,9 +264,17 @@ impl<'n> Session<'n> {
         Ok(())
     }
 
-    /// A message of this node was applied. Has it caught up?
+    /// A message of this node was applied. Has it applied all that the log had?
     fn applied_own(&mut self, counter: u64) {
-        if !matches!(self.catch_up, CatchUp::Announced { counter: at } if at <= counter) {
+        if matches!(self.catch_up, CatchUp::Announced { counter: at } if at <= counter) {
+            self.catch_up = CatchUp::Applied;
+            let Node { applier, continuity, .. } = &mut *self.node;
+            continuity.joined(applier.state(), Instant::now());
+        }
+    }
+
+    fn finish_catch_up(&mut self) {
+        if self.catch_up != CatchUp::Applied || !self.node.continuity.is_known() {
             return;
         }
         self.catch_up = CatchUp::CaughtUp;
@@ -318,7 +351,7 @@ impl<'n> Session<'n> {
             Report::Leased(Ok(true)) => {
                 let until = Instant::now() + self.node.settings.write_timeout;
                 let Node { sender, snapshotter, .. } = &mut *self.node;
-                let counter = sender.send_probe(&mut self.publisher, true, until).await?;
+                let counter = sender.send_probe(&mut self.publisher, true, None, until).await?;
                 snapshotter.requested(counter);
             }
             Report::Leased(Ok(false)) => self.node.snapshotter.postpone(),
@@ -373,6 +406,7 @@ impl<'n> Session<'n> {
             return Err(End::Lost(reason));
         }
         self.prove_contact(now).await?;
+        self.close_seals(now).await?;
         self.send_waiting().await?;
         let Node { applier, snapshotter, comparer, rejoin, .. } = &mut *self.node;
         snapshotter.store_undisputed(&self.background, now);
@@ -408,8 +442,18 @@ impl<'n> Session<'n> {
         let settings = &self.node.settings;
         let quiet = now.saturating_duration_since(self.publisher.last_sent());
         if self.catch_up != CatchUp::Reading && quiet >= settings.tick() {
-            let until = now + settings.write_timeout;
-            self.node.sender.send_probe(&mut self.publisher, false, until).await?;
+            let question = self.node.continuity.question();
+            self.notify(question).await?;
+        }
+        Ok(())
+    }
+
+    /// Closes seals on all nodes, if this one has started and no other one was running.
+    async fn close_seals(&mut self, now: Instant) -> Result<(), End> {
+        let Node { applier, continuity, .. } = &mut *self.node;
+        if let Some(notice) = continuity.due(applier.sequence(), now) {
+            let counter = self.notify(Some(notice)).await?;
+            self.node.continuity.closing(counter);
         }
         Ok(())
     }

@@ -13,8 +13,11 @@ use crate::log::settings::is_word;
 
 const MARK: [u8; 3] = *b"HFL";
 
-/// The newest version of messages: with a deadline. Older nodes would carry out what all others refuse.
-pub(in crate::log) const VERSION: u8 = 3;
+/// The newest version of messages: with a [`Notice`]. Older nodes would not close the seals that all others do.
+pub(in crate::log) const VERSION: u8 = 4;
+
+/// The version of messages with a deadline. Older nodes would carry out what all others refuse.
+const WITH_DEADLINE: u8 = 3;
 
 /// The version of messages without a deadline, and the newest one of snapshots: steps may be under leases.
 pub(in crate::log) const WITH_LEASES: u8 = 2;
@@ -47,7 +50,40 @@ pub(in crate::log) struct Message {
     /// The steps of a message that the stream has stored later are refused. In nanoseconds of Unix time, by
     /// the clock of the stream.
     pub(in crate::log) deadline: Option<i64>,
+    /// Only in a message without steps.
+    pub(in crate::log) notice: Option<Notice>,
     pub(in crate::log) steps: Vec<Step>,
+}
+
+/// What nodes tell each other when one of them starts and a seal that opens once is open.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::log) enum Notice {
+    /// The node has just started, and asks whether another node was running.
+    Asks,
+    /// The node was running when it applied the message at this sequence.
+    Answers { sequence: u64 },
+    /// No node has answered. Seals that open once are closed, if no message has come between this one and the
+    /// one at this sequence.
+    Closes { behind: u64 },
+}
+
+impl Notice {
+    fn encoded(self) -> (u8, u64) {
+        match self {
+            Notice::Asks => (0, 0),
+            Notice::Answers { sequence } => (1, sequence),
+            Notice::Closes { behind } => (2, behind),
+        }
+    }
+
+    fn decode(bytes: &mut &[u8]) -> Option<Notice> {
+        match (bytes.try_get_u8().ok()?, bytes.try_get_u64_le().ok()?) {
+            (0, 0) => Some(Notice::Asks),
+            (1, sequence) => Some(Notice::Answers { sequence }),
+            (2, behind) => Some(Notice::Closes { behind }),
+            _ => None,
+        }
+    }
 }
 
 /// Why bytes are not a message.
@@ -71,6 +107,16 @@ pub(in crate::log) const MAX_NODES: usize = 1024;
 /// The most bytes before the steps, with those before one step.
 pub(in crate::log) const OVERHEAD_BYTES: usize = 128;
 
+/// Encodes a message with a notice.
+pub(in crate::log) fn encode_notice(origin: &Origin, compares: bool, notice: Notice) -> Bytes {
+    let mut out = Vec::with_capacity(OVERHEAD_BYTES);
+    encode_head(VERSION, origin, compares, &mut out);
+    let (kind, sequence) = notice.encoded();
+    out.push(kind);
+    out.extend_from_slice(&sequence.to_le_bytes());
+    out.into()
+}
+
 /// Encodes a message of steps that are encoded already.
 pub(in crate::log) fn encode<'a>(
     origin: &Origin,
@@ -80,18 +126,13 @@ pub(in crate::log) fn encode<'a>(
 ) -> Bytes {
     let len: usize = steps.clone().map(|step| step.len() + 4).sum();
     let mut out = Vec::with_capacity(len + OVERHEAD_BYTES);
-    out.extend_from_slice(&MARK);
     let has_leases = steps.clone().any(encoding::is_under_lease);
-    out.push(match deadline {
-        Some(_) => VERSION,
+    let version = match deadline {
+        Some(_) => WITH_DEADLINE,
         None if has_leases => WITH_LEASES,
         None => WITHOUT_LEASES,
-    });
-    out.push(u8::from(compares));
-    out.push(u8::try_from(origin.node.len()).expect("names of nodes are short"));
-    out.extend_from_slice(origin.node.as_bytes());
-    out.extend_from_slice(&origin.start.to_le_bytes());
-    out.extend_from_slice(&origin.counter.to_le_bytes());
+    };
+    encode_head(version, origin, compares, &mut out);
     if let Some(deadline) = deadline {
         out.extend_from_slice(&deadline.to_le_bytes());
     }
@@ -100,6 +141,16 @@ pub(in crate::log) fn encode<'a>(
         out.extend_from_slice(step);
     }
     out.into()
+}
+
+fn encode_head(version: u8, origin: &Origin, compares: bool, out: &mut Vec<u8>) {
+    out.extend_from_slice(&MARK);
+    out.push(version);
+    out.push(u8::from(compares));
+    out.push(u8::try_from(origin.node.len()).expect("names of nodes are short"));
+    out.extend_from_slice(origin.node.as_bytes());
+    out.extend_from_slice(&origin.start.to_le_bytes());
+    out.extend_from_slice(&origin.counter.to_le_bytes());
 }
 
 pub(in crate::log) fn decode(
@@ -116,8 +167,13 @@ pub(in crate::log) fn decode(
         _ => return Err(MessageError::Malformed),
     };
     let origin = origin(&mut bytes).ok_or(MessageError::Malformed)?;
+    if version == VERSION {
+        let notice = Notice::decode(&mut bytes).filter(|_| bytes.is_empty());
+        let notice = Some(notice.ok_or(MessageError::Malformed)?);
+        return Ok(Message { origin, compares, deadline: None, notice, steps: Vec::new() });
+    }
     let deadline = match version {
-        VERSION => Some(bytes.try_get_i64_le().or(Err(MessageError::Malformed))?),
+        WITH_DEADLINE => Some(bytes.try_get_i64_le().or(Err(MessageError::Malformed))?),
         _ => None,
     };
     let mut steps = Vec::new();
@@ -128,7 +184,7 @@ pub(in crate::log) fn decode(
             encoding::decode(step, members).map_err(|error| MessageError::Step { index, error })?;
         steps.push(step);
     }
-    Ok(Message { origin, compares, deadline, steps })
+    Ok(Message { origin, compares, deadline, notice: None, steps })
 }
 
 fn origin(bytes: &mut &[u8]) -> Option<Origin> {
@@ -188,8 +244,24 @@ mod tests {
             let origin = Origin { node, start, counter };
             let steps: Vec<Step> = addresses.into_iter().map(mask).collect();
             let bytes = encoded(&origin, compares, deadline, &steps);
-            let message = Message { origin, compares, deadline, steps };
+            let message = Message { origin, compares, deadline, notice: None, steps };
             prop_assert_eq!(decode(&bytes, &members()), Ok(message));
+        }
+
+        #[test]
+        fn a_notice_is_decoded_as_it_was(compares: bool, kind in 0..3u8, sequence: u64) {
+            let origin = Origin { node: "a".to_owned(), start: 1, counter: 2 };
+            let notice = match kind {
+                0 => Notice::Asks,
+                1 => Notice::Answers { sequence },
+                _ => Notice::Closes { behind: sequence },
+            };
+            let bytes = encode_notice(&origin, compares, notice);
+            let (deadline, steps) = (None, Vec::new());
+            let message = Message { origin, compares, deadline, notice: Some(notice), steps };
+            prop_assert_eq!(decode(&bytes, &members()), Ok(message));
+            let longer = [&bytes[..], b"\0"].concat();
+            prop_assert_eq!(decode(&longer, &members()), Err(MessageError::Malformed));
         }
 
         #[test]
@@ -217,7 +289,7 @@ mod tests {
     fn bytes_of_others_are_distinguished_from_another_version() {
         let of = |bytes: &[u8]| decode(bytes, &members());
         assert_eq!(of(b"hello"), Err(MessageError::Foreign));
-        assert_eq!(of(b"HFL\x04whatever"), Err(MessageError::Version(4)));
+        assert_eq!(of(b"HFL\x05whatever"), Err(MessageError::Version(5)));
         assert_eq!(of(b"HFL\x01"), Err(MessageError::Malformed));
         let origin = Origin { node: "a".to_owned(), start: 1, counter: 2 };
         let error = of(&encoded(&origin, false, None, &[mask(1), mask(10)])).unwrap_err();
