@@ -272,6 +272,12 @@ def test_a_bucket_of_another_kind_is_named(server: NatsServer) -> None:
             node.leases.want(["x"])
             await until(lambda: "exists without TTLs" in str(node.leases.reason), "it says so")
             assert not node.leases.held
+            assert str(node.leases.reason).endswith(": delete it, so that it is made again")
+            # As of a log whose name ended like the buckets of this one.
+            assert node.client is not None
+            await node.client.jetstream().publish(f"$KV.{BUCKET}.snapshot", b"{}")
+            await until(lambda: "has 1 key, such as 'snapshot'" in str(node.leases.reason), "which")
+            assert str(node.leases.reason).endswith("so delete it only if nothing does")
 
     asyncio.run(work())
 

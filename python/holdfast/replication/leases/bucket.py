@@ -29,6 +29,7 @@ from nats.js.errors import APIError, NoStreamResponseError, NotFoundError
 from holdfast.net.nats.tolerant_client import ServerError, as_quoted
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.runtime.text import counted, quote
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -341,11 +342,22 @@ class LeaseBucket(KeyBucket):
         )
         found = info.config
         if not found.allow_msg_ttl or found.max_msgs_per_subject != 1:
-            raise NotALeaseBucket(
-                f"the bucket {self.name} exists without TTLs of keys or with a history: delete it, "
-                "so that it is made again"
-            )
+            raise NotALeaseBucket(await self._flaw())
         return info.created, info.state.last_seq
+
+    async def _flaw(self) -> str:
+        """Why this is no bucket of leases. Raises the errors of nats-py."""
+        flaw = f"the bucket {self.name} exists without TTLs of keys or with a history"
+        jetstream = self.client.jetstream(timeout=REQUEST_TIMEOUT_S)
+        found = await jetstream.stream_info(self._stream, subjects_filter=">")
+        subjects = sorted(found.state.subjects or ())
+        if not subjects:
+            return f"{flaw}: delete it, so that it is made again"
+        example = quote(subjects[-1].removeprefix(self._subject_prefix))
+        return (
+            f"{flaw}, and has {counted(len(subjects), 'key')}, such as {example}: another log or "
+            "program may need it, so delete it only if nothing does"
+        )
 
     async def settle(self) -> Entry:
         """Marks the bucket as old enough for leases to be taken, see `SETTLED`.
