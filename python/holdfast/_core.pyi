@@ -1219,6 +1219,7 @@ class LogError(Exception):
         "snapshot",
         "replaced",
         "name_taken",
+        "too_many_nodes",
         "differs",
         "thread",
     ]
@@ -1667,6 +1668,12 @@ class Poller:
 
     def stop(self) -> None:
         """Stops polling. Can be called from any thread."""
+
+def check_log_name(name: str) -> None:
+    """Raises `ValueError`, which says what is allowed, if a log can't have this name."""
+
+def check_log_node(name: str) -> None:
+    """Raises `ValueError`, which says what is allowed, if a node of a log can't have this name."""
 
 def pack_raw_ingest(area: Area, values: list[int]) -> bytes:
     """The payload of a Raw Ingest packet.

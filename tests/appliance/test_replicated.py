@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import json
@@ -14,6 +15,7 @@ from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+import nats
 import pytest
 
 import holdfast
@@ -406,6 +408,42 @@ def test_other_areas_are_refused_and_named(
     assert result.exit_code == 2
     # The log is written by a thread of its own, before or after this line.
     assert "holdfast: logs.site: " in {line[:21] for line in result.stderr.splitlines()}
+
+
+def test_a_start_without_a_snapshot_may_succeed_later(
+    node: Callable[..., Appliance], server: NatsServer, tmp_path: Path
+) -> None:
+    async def purge() -> None:
+        client = await nats.connect(server.url)
+        await client.jetstream().purge_stream("OBJ_holdfast-log-site")
+        await client.close()
+
+    node("a")
+    asyncio.run(purge())
+    other = config(tmp_path, [server.url], "b")
+    with pytest.raises(LogNotJoined, match="it is missing: only the next snapshot of a") as caught:
+        Appliance(other).start()
+    assert not caught.value.is_permanent, "the node that runs will store another one"
+    assert invoke("run", str(tmp_path / "b.yaml")).exit_code == 1
+
+
+def test_a_log_has_no_room_for_a_further_node(tmp_path: Path, server: NatsServer) -> None:
+    """As after many starts of a container that has a new name each time."""
+
+    async def join() -> None:
+        client = await nats.connect(server.url)
+        jetstream = client.jetstream()
+        for number in range(1, 1024):
+            name, one = f"pod-{number}".encode(), (1).to_bytes(8, "little")
+            message = b"HFL\x01\x00" + bytes([len(name)]) + name + one + one
+            await jetstream.publish("holdfast.log.site.steps", message)
+        await client.close()
+
+    with Appliance(config(tmp_path, [server.url])):
+        asyncio.run(join())
+    with pytest.raises(LogNotJoined, match=r"logs\.site: the log has had 1024 nodes") as caught:
+        Appliance(config(tmp_path, [server.url], "b")).start()
+    assert caught.value.is_permanent
 
 
 def test_a_change_of_logs_requires_a_restart(

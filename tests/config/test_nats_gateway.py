@@ -336,6 +336,9 @@ def test_everything_else_needs_memories(
         ("  devices", "  fleet: {name: plant}\n  devices", "3: fleet.node: missing, allowed: text"),
         ("  devices", "  fleet: {name: a.b, node: x}\n  devices",
          "3: fleet.name: found 'a.b', allowed: 1 to 32 letters, digits, - and _"),
+        ("  devices", "  fleet: {name: a_wants, node: x}\n  devices",
+         "3: fleet.name: found 'a_wants', allowed: a name that does not end in _wants, as the "
+         "bucket of another fleet does"),
         ("  devices", "  fleet: {name: a, node: x}\n  dialect: tentacle-next\n  devices",
          "4: dialect: found tentacle-next together with fleet, allowed: tentacle"),
         ("  devices", "  fleet: {name: a, node: x}\n  keep_subscriptions: false\n  devices",

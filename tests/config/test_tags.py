@@ -483,8 +483,20 @@ QUOTES = "allowed: 1 to 64 letters, digits, '_', '.' and '-'; quote it to make i
             ["states.on: found 'on', allowed: an integer"],
         ),
         (
+            "logs: {site-leases: {servers: ['nats://127.0.0.1:1'], node: n}}\n" + DEVICE,
+            ["logs.site-leases: found 'site-leases', allowed: a name that does not end in -leases"],
+        ),
+        (
+            "logs: {site-devices: {servers: ['nats://127.0.0.1:1'], node: n}}\n" + DEVICE,
+            ["allowed: a name that does not end in -devices, as buckets of another log do"],
+        ),
+        (
+            "logs: {site: {servers: ['nats://127.0.0.1:1'],\n  node: a.plant.example}}\n" + DEVICE,
+            ["2: logs.site.node: found 'a.plant.example', allowed: 1 to 64 letters, digits, - and"],
+        ),
+        (
             "logs: {a.b: {servers: ['nats://127.0.0.1:1'], node: n}}\n" + DEVICE,
-            ["logs.'a.b': found 'a.b', allowed: a name without '.', which streams can't have"],
+            ["logs.'a.b': found 'a.b', allowed: 1 to 64 letters, digits, - and _"],
         ),
         (
             f"memories: {{plant: {{coils: 5, keep: {{file: {'a' * 300}/b}}}}}}\n"

@@ -68,7 +68,7 @@ mod _core {
     #[pymodule_export]
     use super::listener::{Listener, RawRule, Rule};
     #[pymodule_export]
-    use super::log::{Log, LogError, LogReader};
+    use super::log::{Log, LogError, LogReader, check_log_name, check_log_node};
     #[pymodule_export]
     use super::memory::{Memory, OutOfRange, Stale};
     #[pymodule_export]

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use holdfast_journal::log::{
     Log as Core, LogError as CoreError, LogReader as CoreReader, Login, Phase, Record, Settings,
-    Tls, Until,
+    Tls, Until, check_name, check_node,
 };
 use holdfast_memory::{Access, Action, Memory as CoreMemory, Step, StepWrite};
 use holdfast_runtime::lock;
@@ -25,6 +25,16 @@ pyo3::create_exception!(
     PyException,
     "A log can't be used. `kind` tells why, as one word."
 );
+
+#[pyfunction]
+pub fn check_log_name(name: &str) -> PyResult<()> {
+    check_name(name).map_err(PyValueError::new_err)
+}
+
+#[pyfunction]
+pub fn check_log_node(name: &str) -> PyResult<()> {
+    check_node(name).map_err(PyValueError::new_err)
+}
 
 /// The longest time between two checks for signals.
 const SLICE: Duration = Duration::from_millis(100);

@@ -617,6 +617,51 @@ fn snapshots_are_stored_again_after_a_bucket_of_the_log_was_deleted() {
     }
 }
 
+/// Messages of further nodes would be ignored by all.
+#[test]
+fn a_log_that_has_had_as_many_nodes_as_it_may_takes_no_other() {
+    let server = Server::new();
+    let node = Node::started(&[&server], "a");
+    node.write(0, 7).unwrap();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        for number in 1..1024 {
+            let message = beginning(&format!("pod-{number}"), 1).into();
+            jetstream.publish("holdfast.log.site.steps", message).await.unwrap().await.unwrap();
+        }
+    });
+    let error = Node::new(&[&server], "b", |_| {}).try_start().unwrap_err();
+    assert_eq!(error.kind(), "too_many_nodes");
+    assert!(error.to_string().starts_with("the log has had 1024 nodes"), "{error}");
+    assert_eq!(Node::started(&[&server], "pod-3").read(0), Ok(7));
+    node.write_at_last(0, 8);
+}
+
+/// The bucket of leases of the log `site` is `holdfast-log-site-leases`.
+#[test]
+fn a_log_has_no_name_that_ends_as_buckets_of_another_log_do() {
+    for (name, node, expected) in [
+        (
+            "site-leases",
+            "a",
+            "name is \"site-leases\", allowed: a name that does not end in -leases",
+        ),
+        ("site-devices", "a", "allowed: a name that does not end in -devices"),
+        ("site.a", "a", "name is \"site.a\", allowed: 1 to 64 letters, digits, - and _"),
+        ("site", "a.plant", "node is \"a.plant\", allowed: 1 to 64 letters, digits, - and _"),
+    ] {
+        let settings = Settings::new(name, node, vec!["nats://127.0.0.1:1".to_owned()]);
+        let error = settings.check().unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+    }
+    for name in ["site", "leases", "site-leases-2", "site_devices"] {
+        let settings = Settings::new(name, "a-leases", vec!["nats://127.0.0.1:1".to_owned()]);
+        assert_eq!(settings.check(), Ok(()));
+    }
+}
+
 /// As after a restore that was cut short: it restores the key last.
 #[test]
 fn a_log_with_messages_and_without_the_key_of_its_snapshot_is_not_begun_anew() {
@@ -1101,6 +1146,7 @@ fn a_damaged_snapshot_is_never_loaded() {
     let error = node.try_start().unwrap_err();
     assert_eq!(error.kind(), "snapshot");
     assert!(error.to_string().contains("its digest is"), "{error}");
+    assert!(error.to_string().contains(": only the next snapshot of a node that runs helps"));
     assert_eq!(node.read(0), Err(Refusal::Differs), "nor is it empty");
 }
 

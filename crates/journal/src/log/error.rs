@@ -30,6 +30,11 @@ pub enum LogError {
     #[error("the log has the last possible start of node {0:?}: rename the node")]
     NameUsedUp(String),
     #[error(
+        "the log has had {most} nodes, the most in its life, and {node:?} is not one of them: use the \
+         name of a node that does not run any more, or begin a log with another name"
+    )]
+    TooManyNodes { node: String, most: usize },
+    #[error(
         "the contents at sequence {sequence} have digest {found}, {other}: this node has applied \
          something wrongly"
     )]
@@ -49,6 +54,7 @@ impl LogError {
             LogError::Snapshot(_) => "snapshot",
             LogError::Replaced(_) => "replaced",
             LogError::NameTaken(_) | LogError::NameUsedUp(_) => "name_taken",
+            LogError::TooManyNodes { .. } => "too_many_nodes",
             LogError::Differs { .. } => "differs",
             LogError::Thread(_) => "thread",
         }

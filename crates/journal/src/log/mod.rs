@@ -44,7 +44,7 @@ use holdfast_runtime::lock;
 pub use defaults::{MAX_LAG, WRITE_TIMEOUT};
 pub use error::LogError;
 pub use log_reader::{LogReader, Record, Until};
-pub use settings::{CONTACTS_PER_LAG, Login, Servers, Settings, Tls};
+pub use settings::{CONTACTS_PER_LAG, Login, Servers, Settings, Tls, check_name, check_node};
 pub use shared::Checkpoint;
 pub use status::{Digest, Event, Node, Phase, Status};
 pub use stream::message::Origin;

@@ -83,11 +83,12 @@ impl Settings {
     /// [`LogError::Settings`], which names the setting.
     pub fn check(&self) -> Result<(), LogError> {
         let refused = |text: String| Err(LogError::Settings(text));
-        for (what, name) in [("name", &self.name), ("node", &self.node)] {
-            if !is_word(name) {
-                return refused(format!(
-                    "{what} is {name:?}, allowed: 1 to {MAX_NAME_CHARS} letters, digits, - and _"
-                ));
+        let (name, node) = (&self.name, &self.node);
+        for (what, name, checked) in
+            [("name", name, check_name(name)), ("node", node, check_node(node))]
+        {
+            if let Err(allowed) = checked {
+                return refused(format!("{what} is {name:?}, allowed: {allowed}"));
             }
         }
         if self.servers.urls.is_empty() {
@@ -130,6 +131,35 @@ const MAX_NAME_CHARS: usize = 64;
 
 /// No duration in the settings of a log is shorter.
 const MIN_TIMEOUT: Duration = Duration::from_millis(50);
+
+/// Each log has buckets with its own name and these endings. A log whose name ends so would have its keys in a
+/// bucket of another log, where they expire, or are taken for leases.
+const BUCKETS_OF_LEASES: [&str; 2] = ["-leases", "-devices"];
+
+/// Checks the name of a log.
+///
+/// # Errors
+/// What is allowed.
+pub fn check_name(name: &str) -> Result<(), String> {
+    check_node(name)?;
+    match BUCKETS_OF_LEASES.iter().find(|ending| name.ends_with(**ending)) {
+        Some(ending) => {
+            Err(format!("a name that does not end in {ending}, as buckets of another log do"))
+        }
+        None => Ok(()),
+    }
+}
+
+/// Checks the name of a node.
+///
+/// # Errors
+/// What is allowed.
+pub fn check_node(name: &str) -> Result<(), String> {
+    if is_word(name) {
+        return Ok(());
+    }
+    Err(format!("1 to {MAX_NAME_CHARS} letters, digits, - and _"))
+}
 
 /// Whether a name can be part of a subject, of a stream's name and of a key.
 pub(super) fn is_word(name: &str) -> bool {

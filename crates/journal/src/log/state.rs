@@ -96,6 +96,11 @@ impl State {
         self.members.iter().any(|memory| memory.is_open_once())
     }
 
+    /// Whether messages of this node are applied: the state of the log would grow for ever with new nodes.
+    pub(super) fn has_room_for(&self, node: &str) -> bool {
+        self.origins.len() < MAX_NODES || self.knows(node)
+    }
+
     /// The last start of a node that was applied.
     pub(super) fn last_start(&self, node: &str) -> u64 {
         self.origins.get(node).map_or(0, |(start, _)| *start)
@@ -138,8 +143,8 @@ impl State {
         if self.origins.get(&origin.node).is_some_and(|last| *last >= now) {
             return Ok(Applied::Stale(origin));
         }
-        // The state of the log would grow for ever. All nodes have the same origins, so all ignore it.
-        if self.origins.len() == MAX_NODES && !self.origins.contains_key(&origin.node) {
+        // All nodes have the same origins, so all ignore it.
+        if !self.has_room_for(&origin.node) {
             return Ok(Applied::Ignored(MessageError::TooManyNodes));
         }
         self.origins.insert(origin.node.clone(), now);

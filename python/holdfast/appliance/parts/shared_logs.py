@@ -25,6 +25,10 @@ At most `MAX_CUT_OFF` of `server_lag.rs`: the start must time out, and be retrie
 that lag behind this node count as having lost messages.
 """
 
+PERMANENT = ("layout", "version", "name_taken", "too_many_nodes", "replaced")
+"""The kinds of errors that another start meets again. Not `snapshot`: while a node runs, it stores
+another one."""
+
 EVENTS = {
     "log_connected": logging.INFO,
     "log_caught_up": logging.INFO,
@@ -123,7 +127,7 @@ class SharedLogs(Part):
             log_lines.write(logging.INFO, "log_joining", log=name, node=settings.node)
             log.start(JOIN_TIMEOUT_S)
         except _core.LogError as error:
-            is_permanent = error.kind in ("layout", "version", "snapshot", "name_taken", "replaced")
+            is_permanent = error.kind in PERMANENT
             raise LogNotJoined(f"logs.{name}: {error}", is_permanent=is_permanent) from None
         except ValueError as error:
             raise LogNotJoined(f"logs.{name}: {error}", is_permanent=True) from None

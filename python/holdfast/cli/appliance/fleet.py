@@ -14,7 +14,7 @@ from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.nats import nats_options
 from holdfast.cli.options.option import flag, json_option, option, parsed_by
 from holdfast.cli.terminal_text import counted, print_json, table
-from holdfast.config.values.scanner_settings import PREFIX, parse_member
+from holdfast.config.values.scanner_settings import PREFIX, parse_fleet, parse_member
 from holdfast.net import event_loop
 from holdfast.net.nats.connection import Servers
 from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
@@ -33,7 +33,7 @@ def fleet() -> None:
 
 
 @fleet.command(epilog="Example: holdfast fleet status plant --watch")
-@click.argument("fleet", type=parsed_by(parse_member), metavar="NAME")
+@click.argument("fleet", type=parsed_by(parse_fleet), metavar="NAME")
 @nats_options
 @json_option
 @flag("--watch", "Print anew every second, until Ctrl-C.")
@@ -88,7 +88,7 @@ def _lines(shown: dict[str, Any]) -> list[str]:
 
 
 @fleet.command(epilog="Example: holdfast fleet drain plant scan-a")
-@click.argument("name", type=parsed_by(parse_member))
+@click.argument("name", type=parsed_by(parse_fleet))
 @click.argument("node", type=parsed_by(parse_member))
 @option("--prefix", "SUBJECT", "First part of all subjects.", default=PREFIX)
 @nats_options

@@ -46,6 +46,7 @@ from holdfast.config.values.scanner_settings import (
     Publish,
     Writes,
     check_dialect,
+    parse_fleet,
     parse_member,
     parse_pollable,
     parse_prefix,
@@ -118,7 +119,7 @@ _PARTITIONS = "Parts of the devices in a fleet: 20 times the number of scanners,
 @flag("--strict", "Refuse requests with unknown keys or inexact values, instead of adjusting them.")
 @flag("--publish-logs/--no-publish-logs", "Publish the log on service.logs.modbus.PREFIX.", True)
 @flag("--keep-subscriptions/--no-keep-subscriptions", _KEEP, True)
-@option("--fleet", "NAME", "Share devices with scanners of this fleet.", parsed_by(parse_member))
+@option("--fleet", "NAME", "Share devices with scanners of this fleet.", parsed_by(parse_fleet))
 @option("--node", "NAME", "Name of this scanner in the fleet; unique.", parsed_by(parse_member))
 @number_option("--partitions", _PARTITIONS, 1, MAX_PARTITIONS, PARTITIONS)
 @tls_options("device", "device_tls", DEVICES, " for devices")

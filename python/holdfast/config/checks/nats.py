@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING, Any
 
+from holdfast import _core
 from holdfast.config.checks.common import Owners, check_name, items, until_invalid
 from holdfast.config.checks.tls import check_client_tls, check_files
 from holdfast.config.models.base import INVALID
@@ -168,11 +169,17 @@ def check_dialect_of(path: KeyPath, nats: NatsConfig | NatsOutputConfig, report:
 
 
 def check_servers(path: KeyPath, log: SharedLogConfig, report: Report) -> None:
-    """Reports missing servers, and settings that an embedded server does not have."""
+    """Reports names that the log refuses, missing servers, and what an embedded server has not."""
     written, name = report.raw(path), str(path[-1])
-    if "." in name:
-        message = f"found {show(name)}, allowed: a name without '.', which streams can't have"
-        report.add_key(path, message)
+    try:
+        _core.check_log_name(name)
+    except ValueError as error:
+        report.add_key(path, f"found {show(name)}, allowed: {error}")
+    with until_invalid():
+        try:
+            _core.check_log_node(log.node)
+        except ValueError as error:
+            report.add((*path, "node"), f"found {show(log.node)}, allowed: {error}")
     if "embedded" not in written:
         if "servers" not in written:
             message = "missing, allowed: a list of nats://host:port (optional with embedded)"

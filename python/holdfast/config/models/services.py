@@ -23,6 +23,7 @@ from holdfast.config.values.scalars import (
     EgressEntry,
     FilePath,
     FleetMember,
+    FleetName,
     HostName,
     MemoryNames,
     MqttText,
@@ -288,7 +289,7 @@ class NatsServersConfig(Model):
 class NatsFleetConfig(Model):
     """The fleet of scanners that share the devices."""
 
-    name: FleetMember
+    name: FleetName
     """The name of the fleet."""
     node: FleetMember
     """The name of this scanner in the fleet; unique."""

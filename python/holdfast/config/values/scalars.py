@@ -39,6 +39,7 @@ from holdfast.config.values.host_names import parse_host_name
 from holdfast.config.values.ip_addresses import Bind, parse_bind, parse_peer, parse_source
 from holdfast.config.values.scanner_settings import (
     PREFIX,
+    parse_fleet,
     parse_member,
     parse_pollable,
     parse_prefix,
@@ -432,6 +433,7 @@ SyslogUrl = Annotated[
 NatsUrl = Annotated[
     str, Parsed(_checked(parse_server), "nats://127.0.0.1:4222", "tls://nats.example")
 ]
+FleetName = Annotated[str, Parsed(parse_fleet, pattern="^(?!.*_wants$)[A-Za-z0-9_-]{1,32}$")]
 FleetMember = Annotated[str, Parsed(parse_member, pattern="^[A-Za-z0-9_-]{1,32}$")]
 SubjectPrefix = Annotated[str, Parsed(parse_prefix, PREFIX, "plant.modbus")]
 PollableEntry = Annotated[

@@ -38,6 +38,9 @@ Writes = Literal["tags", "explicit", "none"]
 _MEMBER = re.compile("[A-Za-z0-9_-]{1,32}")
 """Names of fleets are parts of names of buckets, which have no dots."""
 
+WANTS = "_wants"
+"""The end of the name of the bucket of subscriptions: the rest is the bucket of leases."""
+
 PARTITIONS = 256
 MAX_PARTITIONS = 4096
 """The partitions of a fleet: the default, and the most."""
@@ -66,10 +69,19 @@ def parse_server(text: object, *, least_port: int = 1) -> Remote:
 
 
 def parse_member(text: object) -> str:
-    """Checks the name of a fleet or of a node. Raises `ValueError` for anything else."""
+    """Checks the name of a node of a fleet. Raises `ValueError` for anything else."""
     if isinstance(text, str) and _MEMBER.fullmatch(text):
         return text
     raise ValueError(f"found {show(text)}, allowed: 1 to 32 letters, digits, - and _")
+
+
+def parse_fleet(text: object) -> str:
+    """Checks the name of a fleet. Raises `ValueError` for anything else."""
+    name = parse_member(text)
+    if name.endswith(WANTS):
+        taken = f"a name that does not end in {WANTS}, as the bucket of another fleet does"
+        raise ValueError(f"found {show(text)}, allowed: {taken}")
+    return name
 
 
 def parse_prefix(text: object) -> str:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from nats.errors import Error
 
+from holdfast.config.values.scanner_settings import WANTS
 from holdfast.events import log_lines
 from holdfast.replication.leases.bucket import KeyBucket, Outdated
 from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
@@ -79,7 +80,7 @@ class DesiredState:
 
         `on_loss` is called when all revisions that are known have become void.
         """
-        self.bucket = f"holdfast_fleet_{fleet}_wants"
+        self.bucket = f"holdfast_fleet_{fleet}{WANTS}"
         self._fleet = fleet
         self._on_change = on_change
         self._on_loss = on_loss

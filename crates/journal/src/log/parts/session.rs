@@ -14,7 +14,7 @@ use tokio::sync::mpsc::UnboundedReceiver;
 use tokio::time::MissedTickBehavior;
 
 use crate::log::digests::Verdict;
-use crate::log::error::End;
+use crate::log::error::{End, LogError};
 use crate::log::parts::background::{Background, Report};
 use crate::log::parts::comparer::Replayed;
 use crate::log::parts::node::{CHECK_INTERVAL, Node};
@@ -24,7 +24,7 @@ use crate::log::settings::Settings;
 use crate::log::state::{Applied, digest_of};
 use crate::log::status::{Event, Phase};
 use crate::log::stream::connection::{Connected, REQUEST_TIMEOUT, connect};
-use crate::log::stream::message::Notice;
+use crate::log::stream::message::{MAX_NODES, MessageError, Notice};
 use crate::log::stream::messages::Messages;
 use crate::log::stream::raw_message::Received;
 use crate::log::stream::store::{DIGEST_KEY_PREFIX, SNAPSHOT_KEY, Store, parsed};
@@ -203,6 +203,7 @@ impl<'n> Session<'n> {
         if !node.sender.has_started() && node.applier.sequence() < self.stream_end {
             return Ok(());
         }
+        check_room(node)?;
         let last_start = node.applier.state().last_start(&node.settings.node);
         node.sender.ensure_start(last_start)?;
         node.sender.resend(publisher).await?;
@@ -255,6 +256,8 @@ impl<'n> Session<'n> {
                 self.finish_catch_up();
             }
             Applied::Stale(origin) => self.node.sender.check_start(&origin)?,
+            // It may be that of this node, if another new one was first.
+            Applied::Ignored(MessageError::TooManyNodes) => check_room(self.node)?,
             Applied::Ignored(_) => {}
         }
         let sequence = received.place.sequence;
@@ -457,6 +460,15 @@ impl<'n> Session<'n> {
         }
         Ok(())
     }
+}
+
+/// Without room in the log, all nodes would ignore what this one sends.
+fn check_room(node: &Node) -> Result<(), LogError> {
+    let name = &node.settings.node;
+    if node.applier.state().has_room_for(name) {
+        return Ok(());
+    }
+    Err(LogError::TooManyNodes { node: name.clone(), most: MAX_NODES })
 }
 
 async fn open_store(node: &mut Node, client: &Client) -> Result<Store, End> {

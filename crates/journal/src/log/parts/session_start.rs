@@ -144,7 +144,13 @@ async fn load_good(
     {
         return Err(End::Lost("the snapshot was replaced".to_owned()));
     }
-    loaded
+    loaded.map_err(|end| match end {
+        End::Fatal(LogError::Snapshot(text)) => {
+            let helps = "only the next snapshot of a node that runs helps, or a backup";
+            LogError::Snapshot(format!("{text}: {helps}")).into()
+        }
+        other => other,
+    })
 }
 
 #[cfg(test)]
