@@ -617,6 +617,57 @@ fn snapshots_are_stored_again_after_a_bucket_of_the_log_was_deleted() {
     }
 }
 
+/// Removes messages of a stream as an operator may, or its limits do.
+fn purge_stream(server: &Server, name: &str) {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        jetstream.get_stream(name).await.unwrap().purge().await.unwrap();
+    });
+}
+
+/// Nothing tells a node that the key is gone: it looks.
+#[test]
+fn the_key_of_the_snapshot_is_made_anew_when_it_was_purged() {
+    let server = Server::new();
+    let soon = |settings: &mut Settings| settings.examine_every = Duration::from_millis(100);
+    let node = Node::new(&[&server], "a", soon);
+    node.start();
+    node.write(0, 7).unwrap();
+    purge_stream(&server, "KV_holdfast-log-site");
+    let mut events = Vec::new();
+    until("the node says so, and makes it anew", || {
+        events.extend(node.log.take_events(Duration::ZERO));
+        let reason = |what: &str| {
+            events.iter().any(|event| event.fields.iter().any(|(_, value)| value.starts_with(what)))
+        };
+        reason("the key of the snapshot is missing") && reason("keys of the log")
+    });
+    assert_eq!(Node::started(&[&server], "b").read(0), Ok(7));
+}
+
+/// As `nats kv del` does, or whoever may write to the bucket.
+#[test]
+fn the_key_of_the_snapshot_is_made_anew_when_it_was_deleted_or_malformed() {
+    let server = Server::new();
+    let node = Node::started(&[&server], "a");
+    for (headers, value) in
+        [("NATS/1.0\r\nKV-Operation: DEL\r\n\r\n", ""), ("NATS/1.0\r\n\r\n", "not JSON")]
+    {
+        let subject = b"$KV.holdfast-log-site.snapshot";
+        publish_raw(&server, subject, headers.as_bytes(), value.as_bytes());
+        until("it is made anew", || {
+            assert_eq!(node.failure(), None);
+            node.log.take_events(Duration::ZERO).iter().any(|event| {
+                event.name == "log_error" && event.fields[0].1.starts_with("keys of the log")
+            })
+        });
+        node.write_at_last(0, 7);
+        assert_eq!(Node::started(&[&server], "b").read(0), Ok(7));
+    }
+}
+
 /// Messages of further nodes would be ignored by all.
 #[test]
 fn a_log_that_has_had_as_many_nodes_as_it_may_takes_no_other() {

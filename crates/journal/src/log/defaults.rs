@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use super::parts::comparer::DIGEST_EVERY;
 use super::parts::continuity::ANSWER_TIMEOUT;
+use super::parts::session::EXAMINE_EVERY;
 use super::parts::snapshotter::{SNAPSHOT_BYTES, SNAPSHOT_STEPS};
 use super::parts::wrong_contents::REJOIN_AFTER;
 use super::settings::{Login, Servers, Settings};
@@ -33,6 +34,7 @@ impl Settings {
             max_lag: MAX_LAG,
             snapshot_steps: SNAPSHOT_STEPS,
             snapshot_bytes: SNAPSHOT_BYTES,
+            examine_every: EXAMINE_EVERY,
             digest_every: DIGEST_EVERY,
             rejoin_after: Some(REJOIN_AFTER),
             memory_file: None,

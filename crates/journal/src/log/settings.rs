@@ -61,6 +61,9 @@ pub struct Settings {
     /// A snapshot is also taken after so many bytes of messages.
     #[doc(hidden)]
     pub snapshot_bytes: u64,
+    /// How often to look whether the servers still have what the log begins with.
+    #[doc(hidden)]
+    pub examine_every: Duration,
     /// Digests are compared at sequences that are multiples of this.
     pub digest_every: u64,
     /// A node whose contents differ rejoins by itself, unless it has done so within this time; with

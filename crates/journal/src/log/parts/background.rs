@@ -15,8 +15,8 @@ pub(in crate::log) enum Report {
     NotStored { reason: String, known: Option<u64>, found: Result<Option<(u64, Pointer)>, End> },
     /// How many messages were removed behind the newest snapshot, for want of room.
     Freed(Result<u64, String>),
-    /// On how many servers the stream is, if they say so.
-    Replicas(Option<usize>),
+    /// On how many servers the stream is, if they say so. Whether they have lost what the log begins with.
+    Examined { replicas: Option<usize>, found: Result<(), End> },
     /// The digest that the log leads to.
     Replayed { sequence: u64, digest: Result<String, String> },
 }

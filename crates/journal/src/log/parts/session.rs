@@ -32,8 +32,9 @@ use crate::log::stream::store::{DIGEST_KEY_PREFIX, SNAPSHOT_KEY, Store, parsed};
 /// The most further messages that are applied before steps are sent.
 const MAX_FURTHER_MESSAGES: usize = 255;
 
-/// How often to look on how many servers the stream is: an operator can change it while nodes run.
-const REPLICAS_INTERVAL: Duration = Duration::from_secs(60);
+/// How often to look on how many servers the stream is, which an operator can change while nodes run, and
+/// whether the key of the snapshot is still there: no watch says that its stream was purged, or has expired it.
+pub(in crate::log) const EXAMINE_EVERY: Duration = Duration::from_secs(60);
 
 /// The shortest heartbeat that a consumer is asked for.
 const MIN_HEARTBEAT: Duration = Duration::from_millis(200);
@@ -131,9 +132,10 @@ impl<'n> Session<'n> {
         let mut server_error = connected.error.clone();
         let mut checks = tokio::time::interval(CHECK_INTERVAL);
         checks.set_missed_tick_behavior(MissedTickBehavior::Delay);
-        let first = tokio::time::Instant::now() + REPLICAS_INTERVAL;
-        let mut replicas = tokio::time::interval_at(first, REPLICAS_INTERVAL);
-        replicas.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        let every = self.node.settings.examine_every;
+        let first = tokio::time::Instant::now() + every;
+        let mut examinations = tokio::time::interval_at(first, every);
+        examinations.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             if messages.are_calm() {
                 self.consume(&mut messages).await?;
@@ -176,8 +178,9 @@ impl<'n> Session<'n> {
                     return Err(end);
                 }
                 _ = checks.tick() => self.check().await?,
-                _ = replicas.tick() => self.background.spawn(|store| async move {
-                    Report::Replicas(store.replicas().await)
+                _ = examinations.tick() => self.background.spawn(|store| async move {
+                    let replicas = store.replicas().await;
+                    Report::Examined { replicas, found: store.examine().await.map(|_| ()) }
                 }),
             }
         }
@@ -340,7 +343,11 @@ impl<'n> Session<'n> {
     fn watched(&mut self, entry: &kv::Entry) -> Result<(), End> {
         let Node { applier, snapshotter, comparer, .. } = &mut *self.node;
         if entry.key == SNAPSHOT_KEY {
-            snapshotter.learn(entry.revision, parsed(&entry.value)?);
+            match parsed(&entry.value) {
+                Ok(pointer) => snapshotter.learn(entry.revision, pointer),
+                // Deleted, or written by another program.
+                Err(error) => self.key_lost(End::Lost(error.to_string()))?,
+            }
             return Ok(());
         }
         match comparer.receive(applier.state(), &entry.key, &entry.value) {
@@ -365,12 +372,25 @@ impl<'n> Session<'n> {
             Report::NotStored { reason, known, found } => {
                 self.node.snapshotter.failed(&reason, known, found)?;
             }
-            Report::Replicas(Some(found)) => self.node.learn_replicas(found),
-            // The next look does better.
-            Report::Replicas(None) => {}
+            Report::Examined { replicas, found } => {
+                // If the servers don't say, the next look does better.
+                if let Some(replicas) = replicas {
+                    self.node.learn_replicas(replicas);
+                }
+                found.or_else(|end| self.key_lost(end))?;
+            }
             Report::Freed(freed) => self.node.snapshotter.freed(freed),
             Report::Replayed { sequence, digest } => self.replayed(sequence, digest)?,
         }
+        Ok(())
+    }
+
+    /// The log has lost the key of the snapshot. A node that knows what it named makes it anew in the next session.
+    fn key_lost(&mut self, end: End) -> Result<(), End> {
+        if self.node.snapshotter.pointer().is_some() {
+            return Err(end);
+        }
+        self.node.sender.report(&end.reason());
         Ok(())
     }
 

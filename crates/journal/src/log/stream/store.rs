@@ -226,9 +226,9 @@ impl Store {
         }
     }
 
-    /// Makes the key of the snapshot anew if it is missing and the stream goes on behind the snapshot; replaces
-    /// it and removes digests, if a watch can't read them. Returns whether it has done so. A digest that is missing is stored again at the next
-    /// comparison.
+    /// Makes the key of the snapshot anew if it is missing or malformed and the stream goes on behind the
+    /// snapshot; replaces it and removes digests, if a watch can't read them. Returns whether it has done so.
+    /// A digest that is missing is stored again at the next comparison.
     pub(in crate::log) async fn mend_keys(&self, pointer: &Pointer) -> Result<bool, End> {
         let (stream, lost) = (&self.keys.stream_name, |error: &dyn std::fmt::Display| {
             End::lost("mending the keys", error)
@@ -237,7 +237,7 @@ impl Store {
         let mut is_mended = false;
         let entry = fetch(&self.context, stream, which).await?;
         // A deleted key is empty.
-        let is_there = |entry: &Received| entry.is_readable && !entry.payload.is_empty();
+        let is_there = |entry: &Received| entry.is_readable && parsed(&entry.payload).is_ok();
         let is_continued =
             pointer.newest.sequence + 1 >= self.stream.cached_info().state.first_sequence;
         if is_continued && !entry.as_ref().is_some_and(is_there) {
