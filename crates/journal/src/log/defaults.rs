@@ -4,12 +4,12 @@ use std::time::Duration;
 
 use super::parts::comparer::DIGEST_EVERY;
 use super::parts::continuity::ANSWER_TIMEOUT;
+use super::parts::lost_messages::MAX_CUT_OFF;
 use super::parts::session::EXAMINE_EVERY;
 use super::parts::snapshotter::{SNAPSHOT_BYTES, SNAPSHOT_STEPS};
 use super::parts::wrong_contents::REJOIN_AFTER;
 use super::settings::{Login, Servers, Settings};
 use super::stream::connection::CONNECT_TIMEOUT;
-use super::stream::server_lag::MAX_CUT_OFF;
 
 /// Until a write is answered that the log has not confirmed.
 pub const WRITE_TIMEOUT: Duration = Duration::from_secs(1);

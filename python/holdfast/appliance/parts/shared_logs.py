@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 JOIN_TIMEOUT_S = 30.0
 """Seconds in which a node must catch up with its log.
 
-At most `MAX_CUT_OFF` of `server_lag.rs`: the start must time out, and be retried, before servers
+At most `MAX_CUT_OFF` of `lost_messages.rs`: the start must time out, and be retried, before servers
 that lag behind this node count as having lost messages.
 """
 

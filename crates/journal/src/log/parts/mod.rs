@@ -6,6 +6,7 @@ pub(crate) mod background;
 pub(crate) mod comparer;
 pub(crate) mod continuity;
 pub(crate) mod in_flight;
+pub(crate) mod lost_messages;
 pub(crate) mod node;
 pub(crate) mod sender;
 pub(crate) mod session;

@@ -8,7 +8,7 @@
 //! | [`Comparer`] | whether digests of nodes agree |
 //! | [`Rejoin`] | whether the contents are right |
 //! | [`Continuity`] | whether seals that open once may stay open |
-//! | [`ServerLag`] | whether the servers have lost messages |
+//! | [`LostMessages`] | whether the servers have lost messages |
 //!
 //! The parts do not know each other. A session passes on what one of them finds out.
 
@@ -21,13 +21,13 @@ use crate::log::error::{End, LogError};
 use crate::log::parts::applier::Applier;
 use crate::log::parts::comparer::Comparer;
 use crate::log::parts::continuity::Continuity;
+use crate::log::parts::lost_messages::LostMessages;
 use crate::log::parts::sender::Sender;
 use crate::log::parts::snapshotter::Snapshotter;
 use crate::log::parts::wrong_contents::Rejoin;
 use crate::log::settings::Settings;
 use crate::log::shared::{Checkpoint, Shared};
 use crate::log::status::Event;
-use crate::log::stream::server_lag::ServerLag;
 
 /// How often deadlines are checked.
 pub(in crate::log) const CHECK_INTERVAL: Duration = Duration::from_millis(20);
@@ -44,7 +44,7 @@ pub(in crate::log) struct Node {
     pub(in crate::log) comparer: Comparer,
     pub(in crate::log) rejoin: Rejoin,
     pub(in crate::log) continuity: Continuity,
-    pub(in crate::log) lag: ServerLag,
+    pub(in crate::log) lost_messages: LostMessages,
 }
 
 impl Node {
@@ -62,7 +62,7 @@ impl Node {
             comparer: Comparer::new(&settings, &shared),
             rejoin: Rejoin::new(&settings, &shared),
             continuity,
-            lag: ServerLag::new(settings.max_cut_off),
+            lost_messages: LostMessages::new(settings.max_cut_off),
             fingerprint,
             settings,
             shared,
@@ -70,7 +70,7 @@ impl Node {
     }
 
     pub(in crate::log) fn begin_session(&mut self) {
-        self.lag.begin_session();
+        self.lost_messages.begin_session();
         self.snapshotter.begin_session();
         self.comparer.begin_session();
         self.continuity.begin_session();

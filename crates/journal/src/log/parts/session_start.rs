@@ -46,7 +46,7 @@ pub(in crate::log) async fn join(node: &mut Node, store: &Store) -> Result<u64, 
 /// The servers know less than this node.
 pub(in crate::log) fn lags(node: &mut Node, text: String) -> End {
     let error = node.applier.replaced(text);
-    node.lag.judge(error)
+    node.lost_messages.judge(error)
 }
 
 /// Loads the newest snapshot that is good, or makes the first one. The stream goes from `first` to `last`.

@@ -4,5 +4,4 @@ pub(crate) mod connection;
 pub(crate) mod message;
 pub(crate) mod messages;
 pub(crate) mod raw_message;
-pub(crate) mod server_lag;
 pub(crate) mod store;

@@ -10,16 +10,16 @@ use crate::log::error::{End, LogError};
 pub(in crate::log) const MAX_CUT_OFF: Duration = Duration::from_secs(30);
 
 /// Since when the servers have known less than this node, without a session in which they did not.
-pub(in crate::log) struct ServerLag {
+pub(in crate::log) struct LostMessages {
     /// For so long, the servers may be cut off from the others.
     max: Duration,
     in_this_session: Option<Instant>,
     in_last_session: Option<Instant>,
 }
 
-impl ServerLag {
-    pub(in crate::log) fn new(max: Duration) -> ServerLag {
-        ServerLag { max, in_this_session: None, in_last_session: None }
+impl LostMessages {
+    pub(in crate::log) fn new(max: Duration) -> LostMessages {
+        LostMessages { max, in_this_session: None, in_last_session: None }
     }
 
     pub(in crate::log) fn begin_session(&mut self) {
