@@ -10,7 +10,7 @@ import pytest
 
 import holdfast
 from holdfast._core import RETRY_REFUSED_AFTER_S
-from holdfast.client.tag_reading import TagReader
+from holdfast.client.tag_reading import RETRY_ONE_AFTER_S, TagReader
 from holdfast.errors import ConnectFailed, ModbusException, RequestTimeout
 from holdfast.tags import Tag, TagList
 from holdfast.tags.scale import RegisterScale
@@ -92,8 +92,9 @@ def test_neighbours_are_read_with_one_request() -> None:
 
 def test_a_refused_block_costs_only_the_tags_that_the_device_refuses() -> None:
     tags = [tag(f"t{address}", address) for address in range(16)]
+    moment = 0.0
     with FakeDevice(without(5)) as device:
-        reader = TagReader(tags)
+        reader = TagReader(tags, clock=lambda: moment)
         found = read(device, reader)
         assert [each for each in found if each != 7] == [found[5]]
         assert isinstance(found[5], ModbusException)
@@ -101,17 +102,20 @@ def test_a_refused_block_costs_only_the_tags_that_the_device_refuses() -> None:
         assert searching <= 2 * 4 + 1
         assert str(read(device, reader)[5]) == "exception 02 (Illegal Data Address)"
         again = asked(device)[searching:]
-        assert [each for each in again if each[0] <= 5 < sum(each)] == [(5, 1)]
-        assert len(again) <= 5
+        assert all(not address <= 5 < address + count for address, count in again)
+        assert len(again) <= 4
 
 
-def test_a_refused_tag_is_tried_again_with_the_next_reading_and_merged_after_a_minute() -> None:
+def test_a_refused_tag_is_soon_tried_again_and_merged_after_a_minute() -> None:
     moment = 0.0
     absent = [1]
     with FakeDevice(lambda pdu: without(*absent)(pdu)) as device:
         reader = TagReader([tag("a", 0), tag("b", 1)], clock=lambda: moment)
         assert isinstance(read(device, reader)[1], ModbusException)
         absent.clear()
+        moment = RETRY_ONE_AFTER_S - 1
+        assert isinstance(read(device, reader)[1], ModbusException)
+        moment = RETRY_ONE_AFTER_S
         assert read(device, reader) == [7, 7]
         assert asked(device)[-2:] == [(0, 1), (1, 1)]
         moment = RETRY_REFUSED_AFTER_S
@@ -119,17 +123,43 @@ def test_a_refused_tag_is_tried_again_with_the_next_reading_and_merged_after_a_m
         assert asked(device)[-1] == (0, 2)
 
 
-def test_refused_tags_cost_one_request_in_each_reading_until_the_device_answers() -> None:
-    absent = [2, 4, 6]
-    with FakeDevice(lambda pdu: without(*absent)(pdu)) as device:
-        reader = TagReader([tag(f"t{at}", at) for at in (0, *absent)])
+@pytest.mark.parametrize("code", [2, 4, None])
+def test_refused_tags_cost_one_request_until_the_device_has_one(code: int | None) -> None:
+    absent, moment = [2, 4, 6], 0.0
+    refuses: list[int | None] = [2]
+    """What a tag that is absent gets: an exception, or nothing."""
+
+    def answer(pdu: bytes) -> bytes | None:
+        found = without(*absent)(pdu)
+        if found is None or not found[0] & 0x80:
+            return found
+        return None if (with_code := refuses[0]) is None else exception(pdu, with_code)
+
+    with FakeDevice(answer) as device:
+        reader = TagReader([tag(f"t{at}", at) for at in (0, *absent)], clock=lambda: moment)
         read(device, reader)
+        refuses[0] = code
         for at in (2, 4, 6, 2):
+            moment += RETRY_ONE_AFTER_S
             before = len(device.asked)
-            assert read(device, reader)[0] == 7
+            assert read(device, reader, timeout=0.3)[0] == 7
             assert asked(device)[before:] == [(0, 1), (at, 1)]
+            assert read(device, reader)[0] == 7
+            assert asked(device)[before:] == [(0, 1), (at, 1), (0, 1)]
         absent.clear()
+        moment += RETRY_ONE_AFTER_S
         assert read(device, reader) == [7] * 4
+
+
+def test_a_silent_device_is_not_asked_again_for_what_it_has_refused() -> None:
+    is_silent, moment = [False], 0.0
+    with FakeDevice(lambda pdu: None if is_silent[0] else without(2, 4)(pdu)) as device:
+        reader = TagReader([tag(f"t{at}", at) for at in (0, 2, 4)], clock=lambda: moment)
+        read(device, reader)
+        is_silent[0], moment = True, RETRY_ONE_AFTER_S
+        before = len(device.asked)
+        read(device, reader, timeout=0.3)
+        assert asked(device)[before:] == [(0, 1)]
 
 
 def test_other_exceptions_are_not_searched_and_not_remembered() -> None:

@@ -122,26 +122,6 @@ def test_the_status_topic_begins_as_the_others(template: str | None, status: str
 
 
 @pytest.mark.parametrize(
-    ("template", "whole_device", "topic", "device"),
-    [
-        ("a/{device}/{tag}", False, "a/pump/n", "pump"),
-        ("a/{device}/{tag}", False, "a/pump/n/set", "pump"),
-        ("a/{device}/{tag}", False, "a/pump/n/set/reply", "pump"),
-        ("a/{device}/{tag}", False, "a/pump/n/x", None),
-        ("a/{device}/{tag}", False, "b/pump/n", None),
-        ("{tag}/a/{device}/b", False, "n/a/pump/b", "pump"),
-        ("a/{device}", True, "a/pump", "pump"),
-        ("a/{device}", True, "a/pump/n/set", "pump"),
-        ("a/{device}", True, "a/pump/n", None),
-    ],
-)
-def test_the_device_of_a_topic(
-    template: str, whole_device: bool, topic: str, device: str | None
-) -> None:
-    assert TopicNames(template, None, whole_device=whole_device).device_of(topic) == device
-
-
-@pytest.mark.parametrize(
     ("devices", "given", "topic"),
     [
         (("holdfast", "value"), "topic: 'plant/{device}/{tag}/value'", "value"),
@@ -164,6 +144,8 @@ def test_the_availability_of_a_device_has_a_topic_of_its_own(
         "another topic"
     )
     assert Folder(tmp_path).config(text.replace("holdfast:", "pump:"))
+    # A topic that nothing is published to is free.
+    assert Folder(tmp_path).config(text.replace("{status:", "{speed:").replace("true", "false"))
 
 
 def test_with_an_object_for_a_device_commands_have_the_tag_in_their_topic() -> None:
@@ -181,7 +163,7 @@ def test_with_an_object_for_a_device_commands_have_the_tag_in_their_topic() -> N
         ("topic: 'a/{tag}'", "allowed: {device} once, {tag} at most once"),
         ("topic: 'a/{device}'", "topic: found 'a/{device}', allowed: with {tag}"),
         ("topic: 'a/{device}/{tag}', payload: device", "payload: device, allowed: without {tag}"),
-        ("status: plant/pump/x", "which is a topic of the device pump"),
+        ("status: plant/pump/n", "which is a topic of the device pump"),
         ("qos: 2", "qos: found 2, allowed: 0 or 1"),
         ("tls: {}", "tls: found with a url that begins with mqtt://"),
         ("password_file: none", "password_file: found without username"),

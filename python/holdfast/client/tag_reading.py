@@ -34,6 +34,9 @@ MAX_UNANSWERED = 3
 """Requests in a row without an answer that end a reading: a device that is off does not cost a
 timeout for each block."""
 
+RETRY_ONE_AFTER_S = 10
+"""Seconds after a refusal, and between tries of what stays refused."""
+
 ILLEGAL = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)
 """Exceptions that depend on the request, not on the state of the device."""
 
@@ -93,8 +96,9 @@ class _Field:
 class TagReader:
     """Reads tags, and remembers what the device refuses.
 
-    Each reading tries again what has been refused for longest, and goes on to the next as long as
-    the device answers: refusals cost one request in each reading.
+    Some time later, a reading tries again what has been refused for longest, and goes on to the
+    next as long as it gets values. So what a device has again is soon read, and what it does not
+    have costs few requests: some devices close the connection, or are silent, after a refusal.
 
     Gaps of up to `max_gap` registers or bits between tags are read with them.
     """
@@ -113,6 +117,7 @@ class TagReader:
         self._readings: dict[int, Reading] = {}
         self._blocks: list[_Block] = []
         self._planned = 0.0
+        self._retry_at = 0.0
         self._is_as_planned = False
         """Whether nothing has been refused, so that the blocks are still those of the plan."""
 
@@ -150,20 +155,23 @@ class TagReader:
         self._number += 1
         self._readings = {}
         silent = 0
-        retries_refused = True
+        retries_refused = self._clock() >= self._retry_at
         ended: ModbusError | None = None
         blocks: list[_Block] = []
         for block in sorted(self._blocks, key=lambda each: each.rank):
-            was_refused = block.refused
-            failure = was_refused or ended
-            if failure is not None and (ended is not None or not retries_refused):
+            is_retry = block.refused is not None
+            failure = ended
+            if is_retry and (silent or not retries_refused):
+                failure = block.refused
+            if failure is not None:
                 self._fail(block, failure)
                 blocks.append(block)
                 continue
             replacements, error = yield from self._request(block)
             blocks += replacements
-            if was_refused is not None and block.refused is not None:
+            if is_retry and block.refused is not None:
                 retries_refused = False
+                self._retry_at = self._clock() + RETRY_ONE_AFTER_S
             if error is None:
                 silent = 0
                 continue
@@ -179,6 +187,7 @@ class TagReader:
         if self._blocks and (self._is_as_planned or now - self._planned < RETRY_REFUSED_AFTER_S):
             return
         self._planned, self._is_as_planned = now, True
+        self._retry_at = now + RETRY_ONE_AFTER_S
         fields: dict[tuple[Area, int, int], _Field] = {}
         for index, tag in enumerate(self.tags):
             place = tag.area, tag.span.start, len(tag.span)
@@ -206,11 +215,11 @@ class TagReader:
 
     def _request(self, block: _Block) -> Steps[tuple[list[_Block], ModbusError | None]]:
         """Reads a block. Returns the blocks that replace it, and the error of a silent device."""
-        block.requested_in, block.refused = self._number, None
+        block.requested_in = self._number
         try:
             data = yield block
         except ModbusError as error:
-            if isinstance(error, ModbusException) and error.code in ILLEGAL:
+            if isinstance(error, ModbusException) and (error.code in ILLEGAL or block.refused):
                 self._is_as_planned = False
                 if len(block.fields) > 1:
                     return (yield from self._bisect(block))
@@ -218,7 +227,7 @@ class TagReader:
             self._fail(block, error)
             block.answered = not _is_silence(error)
             return [block], None if block.answered else error
-        block.answered = True
+        block.answered, block.refused = True, None
         self._decode(block, data)
         return [block], None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from holdfast.config.checks.common import Owners, check_name, given, items, until_invalid
@@ -15,9 +16,13 @@ from holdfast.config.models.outputs import (
     SparkplugConfig,
 )
 from holdfast.config.text.messages import show
+from holdfast.config.values.mqtt_output_topics import REPLY
 from holdfast.config.values.topics import TAG
+from holdfast.tags import TagError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from holdfast.config.checks.common import Scope
     from holdfast.config.models.outputs import Output
     from holdfast.config.text.yaml_document import KeyPath
@@ -83,17 +88,30 @@ def _check_topics(scope: Scope, path: KeyPath, output: MqttOutputConfig) -> None
     if template is not None and not whole and TAG not in template:
         message = f"found {show(template)}, allowed: with {TAG} (optional with payload: device)"
         scope.report.add((*path, "topic"), message)
-    names, devices = output.topics, scope.names("devices")
-    status = names.status
-    for topic in (status, *map(names.of_availability, devices)):
-        owner = names.device_of(topic)
-        if owner in devices:
-            found = (
-                show(status) if topic == status else f"{show(status)}, and below it {show(topic)}"
-            )
-            message = f"found {found}, which is a topic of the device {owner}"
-            scope.report.add_key((*path, "status"), f"{message}, allowed: another topic")
-            break
+    with until_invalid(), suppress(TagError):  # Tags have checks of their own.
+        known = scope.names("devices")
+        devices = [each for each in output.devices or known if each in known]
+        owners = {
+            topic: device for device in devices for topic in _topics_of(scope, output, device)
+        }
+        status = output.topics.status
+        for topic in (status, *map(output.topics.of_availability, devices)):
+            if (owner := owners.get(topic)) is not None:
+                found = show(status)
+                if topic != status:
+                    found += f", and below it {show(topic)}"
+                message = f"found {found}, which is a topic of the device {owner}"
+                scope.report.add_key((*path, "status"), f"{message}, allowed: another topic")
+                break
+
+
+def _topics_of(scope: Scope, output: MqttOutputConfig, device: str) -> Iterator[str]:
+    """The topics of a device's values; with `writes`, also those of commands and replies."""
+    names, tags = output.topics, [tag.name for tag in scope.config.tags(device)]
+    yield from names.of_values(device, tags)
+    if output.writes:
+        for command in (names.of_commands(device, tag) for tag in tags):
+            yield from (command, f"{command}/{REPLY}")
 
 
 def warn_of_outputs(scope: Scope) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from functools import cached_property
+from typing import TYPE_CHECKING
 
 from holdfast.config.values.topics import DEVICE, TAG
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
 
 BASE = "plant"
 
@@ -26,6 +28,7 @@ class TopicNames:
         if template is None:
             template = f"{BASE}/{DEVICE}" if whole_device else f"{BASE}/{DEVICE}/{TAG}"
         self.template = template
+        self._whole_device = whole_device
         first = template.partition("{")[0].rstrip("/")
         self.status = status or "/".join([*([first] if first else []), STATUS])
         """The topic of the output itself."""
@@ -47,20 +50,9 @@ class TopicNames:
         """The topic that is online while a device answers."""
         return f"{self.status}/{device}"
 
-    def device_of(self, topic: str) -> str | None:
-        """The device for whose values, commands or replies the topic can be."""
-        found = (pattern.fullmatch(topic) for pattern in self._forms)
-        return next((each[1] for each in found if each is not None), None)
-
-    @cached_property
-    def _forms(self) -> list[re.Pattern[str]]:
-        """The forms of all topics of devices."""
-        commands = self.of_commands(DEVICE, TAG)
-        return [
-            re.compile(
-                re.escape(form)
-                .replace(re.escape(DEVICE), "([^/]+)")
-                .replace(re.escape(TAG), "[^/]+")
-            )
-            for form in (self.template, commands, f"{commands}/{REPLY}")
-        ]
+    def of_values(self, device: str, tags: Iterable[str]) -> Iterator[str]:
+        """The topics of the values of a device."""
+        if self._whole_device:
+            yield self.of_device(device)
+        else:
+            yield from (self.of_tag(device, tag) for tag in tags)

@@ -199,9 +199,7 @@ class MqttOutput(BrokerReceiver):
             found = {names.status, *map(names.of_availability, tags)}
         if not self._settings.retain:
             return found
-        if self._settings.payload == "device":
-            return found | {names.of_device(device) for device in tags}
-        return found | {names.of_tag(device, tag) for device, some in tags.items() for tag in some}
+        return found.union(*(names.of_values(device, some) for device, some in tags.items()))
 
     def _remove_stale(self, session: Session) -> None:
         """Removes entities of an earlier configuration, which the broker has kept."""
