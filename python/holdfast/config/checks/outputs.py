@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from holdfast.config.checks.common import Owners, check_name, given, items, until_invalid
@@ -18,7 +17,6 @@ from holdfast.config.models.outputs import (
 from holdfast.config.text.messages import show
 from holdfast.config.values.mqtt_output_topics import REPLY
 from holdfast.config.values.topics import TAG
-from holdfast.tags import TagError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -88,7 +86,7 @@ def _check_topics(scope: Scope, path: KeyPath, output: MqttOutputConfig) -> None
     if template is not None and not whole and TAG not in template:
         message = f"found {show(template)}, allowed: with {TAG} (optional with payload: device)"
         scope.report.add((*path, "topic"), message)
-    with until_invalid(), suppress(TagError):  # Tags have checks of their own.
+    with until_invalid():
         known = scope.names("devices")
         devices = [each for each in output.devices or known if each in known]
         owners = {
@@ -107,7 +105,10 @@ def _check_topics(scope: Scope, path: KeyPath, output: MqttOutputConfig) -> None
 
 def _topics_of(scope: Scope, output: MqttOutputConfig, device: str) -> Iterator[str]:
     """The topics of a device's values; with `writes`, also those of commands and replies."""
-    names, tags = output.topics, [tag.name for tag in scope.config.tags(device)]
+    settings = scope.config.devices[device]
+    profile = None if settings.profile is None else scope.config.profiles.get(settings.profile)
+    found = {*settings.tags, *(() if profile is None else profile.tags)}
+    names, tags = output.topics, [name for name in found if isinstance(name, str)]
     yield from names.of_values(device, tags)
     if output.writes:
         for command in (names.of_commands(device, tag) for tag in tags):
