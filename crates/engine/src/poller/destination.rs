@@ -53,9 +53,9 @@ impl Destination {
         Write { area, address, count: count as usize, bytes }
     }
 
-    /// What tells it and `count` items apart from other ranges of memories.
-    pub(super) fn range(&self, count: u32) -> (*const Memory, Area, u16, u32) {
-        (Arc::as_ptr(&self.memory), self.area, self.address, count)
+    /// What tells it apart from others, whatever the number of items.
+    pub(super) fn start(&self) -> (*const Memory, Area, u16) {
+        (Arc::as_ptr(&self.memory), self.area, self.address)
     }
 
     /// Whether `count` items fit.

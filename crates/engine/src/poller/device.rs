@@ -25,7 +25,7 @@ use tokio::sync::Notify;
 use tokio::time::{Instant, sleep, sleep_until};
 
 use super::cost::Samples;
-use super::destination::{ReadSettings, WriteOutcomes, mirrors};
+use super::destination::{Destination, ReadSettings, WriteOutcomes, mirrors};
 use super::forwarding::{Forward, ForwardSettings};
 use super::panic_guard::{Panicked, catch};
 use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
@@ -419,12 +419,11 @@ impl Device {
     fn keep_outcomes(&mut self, before: &Device) {
         let of = |device: &Device| {
             let reads = device.settings.reads.iter();
-            let ranges = reads.map(|read| read.into.as_ref().map(|into| into.range(read.count)));
-            ranges.collect::<Vec<_>>()
+            reads.map(|read| read.into.as_ref().map(Destination::start)).collect::<Vec<_>>()
         };
         let known: HashMap<_, _> = of(before).into_iter().zip(&before.outcomes).collect();
-        for (range, outcomes) in of(self).iter().zip(&mut self.outcomes) {
-            if let Some(known) = known.get(range) {
+        for (start, outcomes) in of(self).iter().zip(&mut self.outcomes) {
+            if let Some(known) = known.get(start) {
                 outcomes.clone_from(known);
             }
         }

@@ -408,8 +408,17 @@ fn what_memory_has_refused_is_known_after_a_reload() {
         polled(&device).await;
         let mut other = settings(endpoint.clone(), &memory, 20);
         other.reads.extend(same.reads.clone());
-        let elsewhere = settings(endpoint, &memory, 30);
-        let expected = [(same, Health::Error), (other, Health::Error), (elsewhere, Health::Ok)];
+        let mut longer = same.clone();
+        longer.reads[0].count += 1;
+        let elsewhere = settings(endpoint.clone(), &memory, 30);
+        let of_another = settings(endpoint, &self::memory(), 30);
+        let expected = [
+            (same, Health::Error),
+            (other, Health::Error),
+            (longer, Health::Error),
+            (elsewhere, Health::Ok),
+            (of_another, Health::Ok),
+        ];
         for (settings, health) in expected {
             let mut successor = made(settings, &state, &results);
             successor.follow(device);
