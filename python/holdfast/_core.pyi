@@ -545,7 +545,7 @@ class Rule:
     """What the peers of some networks may do, or the client of a serial line.
 
     `units` maps unit ids, 0 to 255, to memories, routes and passages. `sources` are networks or
-    addresses, IPv4 or IPv6; an IPv4-mapped IPv6 address counts as its IPv4 address. A network
+    addresses, IPv4 or IPv6; a peer's IPv4-mapped IPv6 address counts as its IPv4 address. A network
     requires them, a serial line has none. Set `functions`, the allowed function codes, or `deny`,
     the codes that are not allowed, but not both. `roles`, only with TLS, are the allowed roles of
     the peer's certificate: "" is a certificate without a role, `None` is any role. `narrowed` are

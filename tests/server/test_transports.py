@@ -134,6 +134,19 @@ def test_a_rule_of_a_network_requires_sources(memory: holdfast.Memory, scheme: s
         holdfast.Server(rules=[rule], bind=f"{scheme}://127.0.0.1:0")
 
 
+@pytest.mark.parametrize(
+    "more", [{"sources": ["10.0.0.1"]}, {"functions": [3]}, {"deny": [6]}, {"access": "read-only"}]
+)
+@pytest.mark.parametrize("bind", ["tcp://127.0.0.1:0", "rtu:///dev/x"])
+def test_rights_beside_rules_are_refused(
+    memory: holdfast.Memory, bind: str, more: dict[str, Any]
+) -> None:
+    sources = None if bind.startswith("rtu:") else ["127.0.0.1"]
+    rule = holdfast.Rule({1: memory}, sources=sources, access="read-write")
+    with pytest.raises(TypeError, match=r"rules or rights \(units, access, .*\), not both"):
+        holdfast.Server(rules=[rule], bind=bind, **more)
+
+
 @pytest.mark.parametrize("bind", ["tcp://127.0.0.1:0", "udp://127.0.0.1:0", "rtu:///dev/x"])
 def test_only_tls_has_roles(memory: holdfast.Memory, bind: str) -> None:
     sources = None if bind.startswith("rtu:") else ["127.0.0.1"]

@@ -123,8 +123,11 @@ class Server:
                 deny=_listed("deny", deny, CODES) if deny else None,
             )
             rules = [rule]
-        elif units is not None or access is not None:
-            raise TypeError("a server requires units and access, or rules, not both")
+        else:
+            rights = (units, access, sources, functions, deny)
+            if any(each is not None for each in rights):
+                named = "units, access, sources, functions and deny"
+                raise TypeError(f"a server has rules or rights ({named}), not both")
         if not 1 <= index(workers) <= MAX_WORKERS:
             raise ValueError(f"workers is {workers}, allowed: 1 to {MAX_WORKERS}")
         if identity is not None and not isinstance(identity, Identity):
