@@ -96,6 +96,8 @@ __all__ = [
     "Withdrawal",
     "WriteQueue",
     "__version__",
+    "check_log_name",
+    "check_log_node",
     "encode_raw_ingest",
     "https_server_tls",
     "pack_raw_ingest",
