@@ -1,11 +1,15 @@
 //! One connection to the servers. It is not made again: what it had not sent is lost with it. What it
 //! had handed to the system may still arrive later; steps have a deadline for that.
 
+use std::fs::File;
+use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
+use async_nats::rustls::pki_types::pem::PemObject;
+use async_nats::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use async_nats::{Client, ConnectOptions, Event, ServerAddr};
 use tokio::sync::watch;
 
@@ -63,13 +67,11 @@ pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<C
         Some(tls) => {
             let options = options.require_tls(true);
             let options = match &tls.ca {
-                Some(file) => options.add_root_certificates(readable(file)?),
+                Some(file) => options.add_root_certificates(certificates(file)?),
                 None => options,
             };
             match &tls.own {
-                Some((cert, key)) => {
-                    options.add_client_certificate(readable(cert)?, readable(key)?)
-                }
+                Some((cert, own)) => options.add_client_certificate(certificates(cert)?, key(own)?),
                 None => options,
             }
         }
@@ -136,9 +138,50 @@ fn secret(file: &Path) -> Result<String, LogError> {
     Ok(text.strip_suffix('\r').unwrap_or(text).to_owned())
 }
 
-/// The path of a file that can be read.
-fn readable(file: &Path) -> Result<PathBuf, LogError> {
-    // The client names no file in its errors.
-    std::fs::File::open(file).map_err(|error| LogError::file(file, &error))?;
-    Ok(file.to_owned())
+// The client names no file in its errors, and repeats lines of it: one can have a whole key.
+
+/// The path of a file that has certificates.
+fn certificates(file: &Path) -> Result<PathBuf, End> {
+    let found: Result<Vec<_>, _> = CertificateDer::pem_reader_iter(opened(file)?).collect();
+    usable(file, found.is_ok(), "certificates")
+}
+
+/// The path of a file that has a key.
+fn key(file: &Path) -> Result<PathBuf, End> {
+    usable(file, PrivateKeyDer::from_pem_reader(opened(file)?).is_ok(), "a key")
+}
+
+fn opened(file: &Path) -> Result<BufReader<File>, LogError> {
+    File::open(file).map(BufReader::new).map_err(|error| LogError::file(file, &error))
+}
+
+fn usable(file: &Path, is_usable: bool, what: &str) -> Result<PathBuf, End> {
+    if is_usable {
+        return Ok(file.to_owned());
+    }
+    // It may be being written.
+    Err(End::Lost(format!("{}: {what} can't be read, allowed: PEM, in lines", file.display())))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Such a line was repeated in errors, byte for byte.
+    #[test]
+    fn what_is_wrong_with_a_key_or_a_certificate_is_said_without_its_content() {
+        let begin = "-----BEGIN PRIVATE KEY-----";
+        let file = std::env::temp_dir().join(format!("holdfast-one-line-{}", std::process::id()));
+        for text in
+            [format!("{begin} c2VjcmV0 -----END PRIVATE KEY-----"), format!("{begin}\nc2Vj")]
+        {
+            std::fs::write(&file, text).unwrap();
+            for (found, what) in [(key(&file), "a key"), (certificates(&file), "certificates")] {
+                let expected =
+                    format!("{}: {what} can't be read, allowed: PEM, in lines", file.display());
+                assert_eq!(found.unwrap_err().reason(), expected);
+            }
+        }
+        std::fs::remove_file(&file).unwrap();
+    }
 }
