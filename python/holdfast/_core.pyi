@@ -1273,6 +1273,7 @@ class Log:
     def start(self, timeout: float) -> None:
         """Starts the thread of the log, and returns when the memories have caught up.
 
+        While it waits for other nodes to say whether seals stay open, it may take 30 s longer.
         Raises `LogError`, and `ValueError` for a setting or a file that the servers show to be
         unusable. After a timeout or a signal the log is stopped.
         """

@@ -176,6 +176,30 @@ def test_without_a_server_the_start_ends_in_time() -> None:
     assert log.status()["phase"] == "stopped"
 
 
+def test_a_start_does_not_count_the_time_for_which_it_waits_for_other_nodes(
+    nats: NatsServer,
+) -> None:
+    def sealed() -> holdfast.Memory:
+        return holdfast.Memory(coils=64, seal=("coils", 7, "once"))
+
+    def log(node: str, memory: holdfast.Memory) -> Log:
+        return Log("site", node, [nats.url], [("plant", memory)])
+
+    memory = sealed()
+    before = log("a", memory), log("b", sealed())
+    for each in before:
+        each.start(wire.DEADLINE)
+    memory.write("coils", 7, [True])
+    for each in before:
+        each.stop()
+    again = sealed()
+    alone = log("a", again)
+    # Nobody answers for 10 s.
+    alone.start(5)
+    assert (alone.status()["phase"], again.sealed) == ("running", True)
+    alone.stop()
+
+
 def test_a_signal_ends_the_start() -> None:
     log = Log("site", "a", [f"nats://127.0.0.1:{free_port()}"], [("plant", plant())])
     main = threading.main_thread().ident

@@ -36,6 +36,10 @@ pub fn check_log_node(name: &str) -> PyResult<()> {
     check_node(name).map_err(PyValueError::new_err)
 }
 
+/// How much longer a start may take while it waits for other nodes to say whether seals stay open: they answer
+/// within 10 s, and messages of other nodes may delay that which closes the seals.
+const ASKING: Duration = Duration::from_secs(30);
+
 /// The longest time between two checks for signals.
 const SLICE: Duration = Duration::from_millis(100);
 
@@ -107,18 +111,19 @@ impl Log {
 
     fn start(&self, py: Python<'_>, timeout: f64) -> PyResult<()> {
         let timeout = seconds("timeout", timeout)?;
-        let end = Instant::now() + timeout;
+        let began = Instant::now();
         self.core.start().map_err(to_py_err)?;
         loop {
-            let left = end.saturating_duration_since(Instant::now()).min(SLICE);
+            let most = if self.core.is_asking() { timeout + ASKING } else { timeout };
+            let left = most.saturating_sub(began.elapsed()).min(SLICE);
             let caught_up =
                 py.detach(|| self.core.wait_until_caught_up(left)).map_err(to_py_err)?;
             if caught_up {
                 return Ok(());
             }
             let signalled = py.check_signals();
-            if signalled.is_err() || Instant::now() >= end {
-                let error = self.core.no_connection(timeout);
+            if signalled.is_err() || began.elapsed() >= most {
+                let error = self.core.no_connection(most);
                 py.detach(|| self.core.stop());
                 return signalled.and(Err(to_py_err(error)));
             }

@@ -5,7 +5,7 @@ mod nodes;
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_journal::log::{LogReader, Settings, Until};
+use holdfast_journal::log::{LogReader, Phase, Settings, Until};
 use holdfast_memory::{Access, Action, Gate, GateMode, Layout, Memory, Refusal, Span, Write};
 use nodes::{DEADLINE, GATE, Node, Server, memory_of, until};
 
@@ -108,11 +108,69 @@ fn a_node_that_gave_no_answer_is_sealed_again_with_the_one_that_has_started() {
     b.log.stop();
     let waiting = node(&server, "b", DEADLINE * 10);
     waiting.log.start().unwrap();
-    until("the other node asks", || waiting.status().contact_age.is_some());
+    until("the other node asks", || waiting.log.is_asking());
+    let error = waiting.log.no_connection(DEADLINE).to_string();
+    assert!(error.contains("no other node has said"), "{error}");
     let a = started(&server, "a");
     assert_eq!(a.read(0), Err(Refusal::Sealed));
     assert!(waiting.log.wait_until_caught_up(DEADLINE).unwrap());
+    assert!(!waiting.log.is_asking());
     assert_eq!(waiting.read(0), Err(Refusal::Sealed));
+}
+
+#[test]
+fn a_node_with_the_shortest_lag_closes_seals_too() {
+    let server = Server::new();
+    let start = |name| {
+        let node = Node::with(sealed(GateMode::Once), &[&server], name, |settings| {
+            settings.answer_timeout = Duration::from_millis(50);
+            settings.max_lag = Duration::from_millis(50);
+        });
+        node.start();
+        node
+    };
+    let [a, b] = ["a", "b"].map(start);
+    opened_by(&a.memory);
+    a.log.stop();
+    b.log.stop();
+    assert_eq!(start("a").read(0), Err(Refusal::Sealed));
+}
+
+#[test]
+fn a_node_whose_contents_were_wrong_while_it_asked_serves_when_it_knows() {
+    const COMPARED: u64 = 100;
+    let server = Server::new();
+    let names = ["a", "b", "c"];
+    let node = |name| {
+        Node::with(sealed(GateMode::Once), &[&server], name, |settings| {
+            settings.answer_timeout = DEADLINE * 10;
+            settings.digest_every = COMPARED;
+        })
+    };
+    let before = names.map(node);
+    before.iter().for_each(Node::start);
+    opened_by(&before[0].memory);
+    while before[0].status().sequence < COMPARED - 10 {
+        before[0].write(0, 7).unwrap();
+    }
+    before.iter().for_each(|node| node.log.stop());
+    let nodes = names.map(node);
+    nodes.iter().for_each(|node| node.log.start().unwrap());
+    let wrong = &nodes[2];
+    until("all ask", || nodes.iter().all(|node| node.log.is_asking()));
+    let mut contents = Memory::contents(std::slice::from_ref(&wrong.memory)).remove(0);
+    contents.areas[2][1] ^= 1;
+    wrong.memory.restore(&contents);
+    let is_returning = || matches!(wrong.status().phase, Phase::Returning(_));
+    until("its contents are found wrong", is_returning);
+    until("it asks again", || wrong.log.is_asking());
+    // It waits no longer, and closes the seals.
+    started(&server, "d");
+    until("its contents are right", || !is_returning());
+    assert_eq!(wrong.status().phase, Phase::Running);
+    assert!(wrong.status().sequence < 2 * COMPARED, "not only at the next comparison");
+    opened_by(&wrong.memory);
+    assert_eq!(wrong.read(0), Ok(7));
 }
 
 #[test]

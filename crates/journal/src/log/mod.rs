@@ -152,13 +152,22 @@ impl Log {
         }
     }
 
+    /// Whether it has applied all that the log had, and waits for other nodes to say whether seals stay open.
+    pub fn is_asking(&self) -> bool {
+        let view = self.shared.view();
+        view.is_asking && view.server.is_some()
+    }
+
     /// The error that says why the log did not catch up within a time.
     pub fn no_connection(&self, within: Duration) -> LogError {
-        let last = self.shared.view().last_error;
-        LogError::NoConnection {
-            within,
-            last: last.unwrap_or_else(|| "it has more messages".to_owned()),
-        }
+        let last = if self.is_asking() {
+            "no other node has said whether seals stay open, and they could not be closed"
+                .to_owned()
+        } else {
+            let last = self.shared.view().last_error;
+            last.unwrap_or_else(|| "it has more messages".to_owned())
+        };
+        LogError::NoConnection { within, last }
     }
 
     /// Refuses writes from now on, waits for those that were sent, and ends the thread.

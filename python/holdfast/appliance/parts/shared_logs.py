@@ -22,7 +22,8 @@ JOIN_TIMEOUT_S = 30.0
 """Seconds in which a node must catch up with its log.
 
 At most `MAX_CUT_OFF` of `lost_messages.rs`: the start must time out, and be retried, before servers
-that lag behind this node count as having lost messages.
+that lag behind this node count as having lost messages. The time for which it asks other nodes
+about seals does not count: it has applied all that the servers have then.
 """
 
 PERMANENT = ("layout", "version", "name_taken", "too_many_nodes", "replaced")

@@ -73,7 +73,7 @@ impl Node {
         self.lost_messages.begin_session();
         self.snapshotter.begin_session();
         self.comparer.begin_session();
-        self.continuity.begin_session();
+        self.continuity.begin_session(Instant::now());
     }
 
     /// The stream is on this many servers: it keeps those with which it was made, until an operator

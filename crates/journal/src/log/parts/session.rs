@@ -59,8 +59,10 @@ enum CatchUp {
     Announced {
         counter: u64,
     },
-    /// It has applied all, and waits until it knows whether seals stay open.
-    Applied,
+    /// It has applied all, up to this sequence, and waits until it knows whether seals stay open.
+    Applied {
+        sequence: u64,
+    },
     CaughtUp,
 }
 
@@ -114,7 +116,7 @@ impl<'n> Session<'n> {
         let (stream_end, replicas) = (info.state.last_sequence, info.config.num_replicas);
         let server = connected.server.clone();
         node.shared.event(Event::new("log_connected", &[("server", &server)]));
-        node.shared.update(|view| view.server = Some(server));
+        node.shared.update(|view| (view.server, view.is_asking) = (Some(server), false));
         node.learn_replicas(replicas);
         let (background, reports) = Background::new(store);
         let (now, catch_up) = (Instant::now(), CatchUp::Reading);
@@ -217,7 +219,8 @@ impl<'n> Session<'n> {
         Ok(())
     }
 
-    /// Answers a node that has started.
+    /// Answers a node that has started. Before a session has sent again what was not confirmed, all nodes would
+    /// take that as overtaken by the answer.
     async fn answer(&mut self) -> Result<(), End> {
         if self.catch_up == CatchUp::CaughtUp
             && let Some(answer) = self.node.continuity.take_answer()
@@ -255,7 +258,7 @@ impl<'n> Session<'n> {
                     self.applied_own(counter);
                 }
                 let Node { applier, continuity, .. } = &mut *self.node;
-                continuity.applied(applier.state(), notice, own);
+                continuity.applied(applier.state(), &origin.node, notice, own, self.last_applied);
                 self.finish_catch_up();
             }
             Applied::Stale(origin) => self.node.sender.check_start(&origin)?,
@@ -273,20 +276,22 @@ impl<'n> Session<'n> {
     /// A message of this node was applied. Has it applied all that the log had?
     fn applied_own(&mut self, counter: u64) {
         if matches!(self.catch_up, CatchUp::Announced { counter: at } if at <= counter) {
-            self.catch_up = CatchUp::Applied;
-            let Node { applier, continuity, .. } = &mut *self.node;
-            continuity.joined(applier.state(), Instant::now());
+            let Node { shared, applier, continuity, .. } = &mut *self.node;
+            self.catch_up = CatchUp::Applied { sequence: applier.sequence() };
+            continuity.joined(applier.state(), self.last_applied);
+            shared.update(|view| view.is_asking = !continuity.is_known());
         }
     }
 
     fn finish_catch_up(&mut self) {
-        if self.catch_up != CatchUp::Applied || !self.node.continuity.is_known() {
+        let CatchUp::Applied { sequence } = self.catch_up else { return };
+        if !self.node.continuity.is_known() {
             return;
         }
         self.catch_up = CatchUp::CaughtUp;
-        let Node { shared, applier, rejoin, .. } = &mut *self.node;
+        let Node { shared, rejoin, .. } = &mut *self.node;
         shared.open(self.publisher.max_steps_bytes());
-        let sequence = applier.sequence();
+        shared.update(|view| view.is_asking = false);
         shared.event(Event::new("log_caught_up", &[("sequence", &sequence.to_string())]));
         if rejoin.caught_up(sequence) {
             shared.update(|view| {
@@ -462,10 +467,16 @@ impl<'n> Session<'n> {
 
     /// Sends a message if nothing was sent for a while: when it is applied, the contents are current.
     async fn prove_contact(&mut self, now: Instant) -> Result<(), End> {
-        let settings = &self.node.settings;
-        let quiet = now.saturating_duration_since(self.publisher.last_sent());
-        if self.catch_up != CatchUp::Reading && quiet >= settings.tick() {
-            let question = self.node.continuity.question();
+        let Node { settings, continuity, .. } = &*self.node;
+        let last_sent = self.publisher.last_sent();
+        let (last, pause) = match self.catch_up {
+            CatchUp::Reading => return Ok(()),
+            // Seldom: a message that closes seals does not count behind it, whoever sends the one or the other.
+            CatchUp::Applied { .. } => (last_sent.max(self.last_applied), settings.silence() / 2),
+            CatchUp::Announced { .. } | CatchUp::CaughtUp => (last_sent, settings.tick()),
+        };
+        if now.saturating_duration_since(last) >= pause {
+            let question = continuity.question();
             self.notify(question).await?;
         }
         Ok(())
@@ -476,7 +487,7 @@ impl<'n> Session<'n> {
         let Node { applier, continuity, .. } = &mut *self.node;
         if let Some(notice) = continuity.due(applier.sequence(), now) {
             let counter = self.notify(Some(notice)).await?;
-            self.node.continuity.closing(counter);
+            self.node.continuity.closing(counter, now);
         }
         Ok(())
     }
