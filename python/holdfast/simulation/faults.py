@@ -93,7 +93,8 @@ class FaultProxy:
         if self.address[0] != "::":
             return await asyncio.start_server(self._accept, *self.address)
         # asyncio would accept only IPv6 there, unlike all other servers.
-        opened = socket.create_server(self.address, family=socket.AF_INET6, dualstack_ipv6=True)
+        both = socket.has_dualstack_ipv6()
+        opened = socket.create_server(self.address, family=socket.AF_INET6, dualstack_ipv6=both)
         return await asyncio.start_server(self._accept, sock=opened)
 
     def _end(self) -> None:
