@@ -24,11 +24,11 @@
 mod area;
 mod bits;
 mod error;
-mod flattening;
 mod follower;
 mod memory;
 mod mirrored;
 mod operation;
+mod runs;
 mod seal;
 mod step;
 mod write_queue;

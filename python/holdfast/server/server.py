@@ -269,7 +269,10 @@ def _other_type(name: str, value: object) -> str | None:
 
 
 def _check_rule(scheme: str, rule: Rule) -> None:
-    """Raises `ValueError` for what a rule has and this scheme does not, or the other way round."""
+    """Raises `ValueError` for what a rule has and this scheme does not, or the other way round.
+
+    Raises `TypeError` for what is no rule.
+    """
     if not isinstance(rule, _core.Rule):
         raise TypeError(f"found the rule {rule!r}, allowed: holdfast.Rule(…)")
     if scheme != "tls" and rule.roles is not None:

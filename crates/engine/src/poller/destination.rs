@@ -86,7 +86,7 @@ impl WriteOutcomes {
         self.newest.fetch_max(number * 2 + u64::from(!is_stored), Ordering::Relaxed);
     }
 
-    /// Ignores what becomes of the writes so far.
+    /// Outcomes of the writes so far do not count any more.
     pub(super) fn forget(&self) {
         self.end(self.begin(), true);
     }

@@ -3,7 +3,7 @@
 mod device_checks;
 mod error;
 mod links;
-mod polled;
+mod polled_device;
 mod running_device;
 
 use std::collections::{HashMap, HashSet};
@@ -24,7 +24,7 @@ use tokio::task::{LocalSet, spawn_local};
 use self::device_checks::checked;
 pub use self::error::PollerError;
 use self::links::{Address, Links, address};
-pub use self::polled::Polled;
+pub use self::polled_device::Polled;
 use self::running_device::RunningDevice;
 use super::device::{DeviceSettings, Planned};
 use super::results::{Receivers, Results, Written};

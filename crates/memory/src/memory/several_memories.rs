@@ -4,10 +4,10 @@ use std::ptr;
 use std::sync::{Arc, RwLockWriteGuard};
 
 use crate::error::{Refusal, Refused};
-use crate::flattening::{self, Run};
 use crate::memory::checks::{Ranges, check_across, check_each};
 use crate::memory::{Content, Memory, Writer};
 use crate::operation::{Access, Write};
+use crate::runs::{self, Run};
 use crate::step::{Action, Done, Journal, Step, StepWrite, wait};
 
 /// The access of a batch of data, by whether each of its writes is granted only while its memory is sealed. A batch is
@@ -88,12 +88,12 @@ fn write_checked(writer: Writer, writes: &[(&Memory, Write<'_>)]) -> Result<(), 
         .collect();
     // The sort is stable: writes to one area of one memory keep their order.
     placed.sort_by_key(|placed| (placed.memory.rank, placed.write.area));
-    if !flattening::is_large(placed.iter().map(|placed| &placed.write)) {
+    if !runs::is_large(placed.iter().map(|placed| &placed.write)) {
         return apply_across(writer, &placed);
     }
     let flat: Vec<(&Placed, Vec<Run>)> = placed
         .chunk_by(|a, b| ptr::eq(a.memory, b.memory) && a.write.area == b.write.area)
-        .map(|writes| (&writes[0], flattening::flatten(writes.iter().map(|placed| &placed.write))))
+        .map(|writes| (&writes[0], runs::flatten(writes.iter().map(|placed| &placed.write))))
         .collect();
     let runs: Vec<Placed> = flat
         .iter()

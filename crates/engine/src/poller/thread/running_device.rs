@@ -12,7 +12,7 @@ use tokio::sync::watch;
 use tokio::task::{AbortHandle, spawn_local};
 
 use super::links::UsedLink;
-use super::polled::Polled;
+use super::polled_device::Polled;
 use crate::link::{Fault, Fence, Link, Permit, Priority, Stage, Wanted, fault, standstill};
 use crate::poller::destination::{ReadSettings, mirrors};
 use crate::poller::device::{Device, DeviceSettings, Inbox, Planned};
