@@ -1,4 +1,4 @@
-"""Whether a written value between two values of the registers is rounded or refused."""
+"""Whether a written value between two steps of the registers is rounded, and to which step."""
 
 from __future__ import annotations
 
