@@ -152,6 +152,33 @@ def test_a_write_that_is_sent_again_before_its_reply_reaches_the_device_once(run
         assert len(writes_of(source)) == 1
 
 
+def test_a_route_does_not_overtake_a_write_of_its_connection_that_is_passed_on(run: Run) -> None:
+    """Both wait for a poll: the one for its device's turn, the other for the link alone."""
+    is_asked, goes_on = threading.Event(), threading.Event()
+
+    def slow(asked: Asked) -> None:
+        if held:
+            is_asked.set()
+            assert goes_on.wait(wire.DEADLINE)
+        asked.answer()
+
+    held = False
+    with plc(slow) as source:
+        meter = device(source.url, *READS, interval=0.05, writes="pass", timeout=wire.DEADLINE)
+        rule = {**RULE, "units": {1: "mirror", 9: {"route": "meter"}}}
+        scada = {**MORE["listeners"]["scada"], "rules": [rule]}
+        appliance = run(configuration({"meter": meter}, **{**MORE, "listeners": {"scada": scada}}))
+        until_read(appliance)
+        held = True
+        assert is_asked.wait(wire.DEADLINE)
+        with wire.Connection(endpoint(appliance, "scada")) as writer:
+            passed, routed = b"\x06\x00\x0a\x00\x01", b"\x06\x01\xf4\x00\x02"
+            writer.send(wire.frame(passed) + wire.frame(routed, 9))
+            goes_on.set()
+            assert [each.pdu for each in writer.receive_many(2)] == [passed, routed]
+        assert writes_of(source) == [b"\x06\x01\xf4\x00\x01", routed]
+
+
 def test_coils_reach_the_device_and_then_memory(run: Run) -> None:
     with plc() as source:
         appliance = started(run, source)

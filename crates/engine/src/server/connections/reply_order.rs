@@ -1,5 +1,5 @@
 //! Requests of a connection whose replies come later. Replies keep the order of their requests, and
-//! only requests that are answered elsewhere overtake each other on their way.
+//! only requests that devices answer over routes, or steps of journals, are on their way at the same time.
 //!
 //! A request that can be answered here waits until all before it are answered: its client expects the
 //! effects of those. All behind it wait too. The connection is read meanwhile: its end, a repetition or a newer
@@ -8,6 +8,7 @@
 //! No reply may come to a request that its client has given up (`given_up.rs`).
 
 use std::collections::VecDeque;
+use std::mem::{Discriminant, discriminant};
 use std::net::IpAddr;
 use std::pin::Pin;
 use std::sync::Arc;
@@ -46,8 +47,8 @@ pub(in crate::server) struct Waiting {
     times: usize,
     /// Whether no other request with its transaction id has come after it.
     is_newest: bool,
-    /// Whether a journal carries it out. Those of a connection are carried out in their order.
-    is_step: bool,
+    /// What answers it, and keeps the order of what it is asked. Whatever others answer waits.
+    answered_by: Discriminant<Elsewhere>,
 }
 
 /// A request that is answered elsewhere.
@@ -127,11 +128,11 @@ impl Deferred {
         let place = match place.filter(|_| self.behind.is_empty()) {
             // Without a request before it, nothing can reorder its effects.
             None if self.is_empty() => return Deferral::Now,
-            Some(place @ Elsewhere::Device(_)) if self.has_room() => place,
             // A write to a mirror also changes the memory, which requests before it may read or write.
             Some(place @ Elsewhere::Mirror(_)) if self.is_empty() => place,
-            Some(place @ Elsewhere::Journal(_))
-                if self.has_room() && self.waiting.iter().all(|waiting| waiting.is_step) =>
+            Some(place @ (Elsewhere::Device(_) | Elsewhere::Journal(_)))
+                if self.has_room()
+                    && self.waiting.iter().all(|other| other.answered_by == discriminant(place)) =>
             {
                 place
             }
@@ -146,8 +147,8 @@ impl Deferred {
             Asked::send(context, place, (tag, unit_id, request), |permit| {
                 unit_server.forward(rights, place, &asker, unit_id, request, permit)
             });
-        let is_step = matches!(place, Elsewhere::Journal(_));
-        self.waiting.push_back(Waiting { asked, reply, times: 1, is_newest: true, is_step });
+        let answered_by = discriminant(place);
+        self.waiting.push_back(Waiting { asked, reply, times: 1, is_newest: true, answered_by });
         Deferral::Later(refused)
     }
 
