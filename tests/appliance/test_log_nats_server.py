@@ -34,7 +34,7 @@ from support import wire
 from support.brokers import free_port
 from support.cli import RunCommand, answer, done, invoke
 from support.config_folder import Folder
-from support.machine import is_over, missing
+from support.machine import full_disk, is_over, missing
 from support.running import endpoint
 
 if TYPE_CHECKING:
@@ -205,12 +205,8 @@ def failed_writes(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 def test_a_folder_has_room_if_its_disk_takes_a_file(tmp_path: Path) -> None:
     assert has_room(tmp_path)
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
-    try:
+    with full_disk(1000):
         assert not has_room(tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not (tmp_path / "room").exists()
 
 

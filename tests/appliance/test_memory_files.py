@@ -26,6 +26,7 @@ from holdfast.config import load
 from support import wire
 from support.cli import RunCommand, invoke
 from support.config_folder import Folder, written
+from support.machine import full_disk
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -161,12 +162,8 @@ def test_a_file_that_is_damaged_or_in_use_keeps_everything_from_starting(tmp_pat
 
 def test_a_disk_that_is_full_may_have_room_at_the_next_start(tmp_path: Path) -> None:
     config(tmp_path)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
-    try:
+    with full_disk():
         assert "File too large" in not_started(tmp_path, 1)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def not_started(folder: Path, exit_code: int) -> str:

@@ -10,6 +10,7 @@ import holdfast
 from holdfast._core import MemoryFile
 from holdfast.config.text import yaml_document
 from support.cli import answer, done, invoke, usage_error
+from support.machine import full_disk
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -130,6 +131,15 @@ def test_values_are_merged_on_request(file: str, tmp_path: Path) -> None:
     assert registers(file) == [7, 5, 8, 1]
     done("memory", "import", file, str(tmp_path / "v.csv"))
     assert registers(file) == [0, 5, 0, 0]
+
+
+def test_an_export_that_fails_leaves_the_one_before(file: str, tmp_path: Path) -> None:
+    values = tmp_path / "values.csv"
+    values.write_text("backup")
+    with full_disk(5):
+        result = invoke("memory", "export", file, "--output", str(values))
+    assert "File too large" in result.stderr
+    assert [values.read_text(), *tmp_path.glob(".*")] == ["backup"]
 
 
 def test_the_export_is_csv_on_standard_output(file: str) -> None:

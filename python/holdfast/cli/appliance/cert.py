@@ -27,10 +27,10 @@ from holdfast.cli.options.option import (
 )
 from holdfast.cli.terminal_text import plain, print_json
 from holdfast.net.certificates import authority as making
-from holdfast.net.certificates import files as pem_files
 from holdfast.net.certificates import inspection
 from holdfast.net.certificates.parser import certificates, key_pem
 from holdfast.net.certificates.pem import UnusableFile, content, is_locked, passphrase
+from holdfast.runtime import whole_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -278,8 +278,8 @@ def _check_name(name: str) -> None:
 
 def _write(folder: Path, name: str, chain: bytes, key: bytes) -> None:
     certificate_file, key_file = folder / f"{name}.pem", folder / f"{name}.key"
-    pem_files.write_new(
-        {key_file: (key, pem_files.SECRET), certificate_file: (chain, pem_files.PUBLIC)}
+    whole_files.write_new(
+        {key_file: (key, whole_files.SECRET), certificate_file: (chain, whole_files.PUBLIC)}
     )
     click.echo(f"Written: {certificate_file} and {key_file}.")
 
@@ -287,7 +287,7 @@ def _write(folder: Path, name: str, chain: bytes, key: bytes) -> None:
 def _write_list(authority: Authority, file: Path, days: int, serials: list[int]) -> None:
     before = making.read_revocation_list(file) if file.exists() else None
     made = authority.revocation_list(before, serials, days)
-    pem_files.replace(file, making.list_pem(made))
+    whole_files.replace(file, making.list_pem(made))
     count = len(made)
     noun = "1 certificate is" if count == 1 else f"{count} certificates are"
     click.echo(f"Written: {file}; {noun} revoked.")

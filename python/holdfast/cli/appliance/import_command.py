@@ -36,6 +36,7 @@ from holdfast.importing import (
     read_replicator,
     read_telegraf,
 )
+from holdfast.runtime import whole_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -211,8 +212,10 @@ def _refuse(error: ConfigError, as_json: bool) -> None:
 
 def _write(output: Path, text: str, force: bool) -> None:
     try:
-        with output.open("w" if force else "x", encoding="utf-8") as file:
-            file.write(text)
+        if force:
+            whole_files.replace(output, text.encode())
+        else:
+            whole_files.write_new({output: (text.encode(), whole_files.PUBLIC)})
     except FileExistsError:
         fail(f"{output}: already exists; --force overwrites it", reason="file", prefix="")
     except OSError as error:

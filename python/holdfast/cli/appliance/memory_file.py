@@ -12,6 +12,7 @@ from holdfast import _core
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.option import require_known
 from holdfast.config.initial_values import KINDS, runs_of
+from holdfast.runtime import whole_files
 from holdfast.runtime.text import listing
 from holdfast.types import BIT_AREAS
 
@@ -119,9 +120,9 @@ def written(areas: Mapping[Area, KeptArea], kind: str, *, zeros: bool) -> str:
 
 
 def write(file: Path, text: str) -> None:
-    """Writes a file, or ends the program."""
+    """Writes a file, or ends the program: a failed export leaves the one before as it was."""
     try:
-        file.write_text(text, encoding="utf-8")
+        whole_files.replace(file, text.encode())
     except OSError as error:
         fail(f"{file}: {error.strerror or error}", ExitCode.WRONG)
 

@@ -43,7 +43,7 @@ from holdfast.config.tag_files.write import tags_as_csv, tags_as_yaml
 from holdfast.discovery import description, device_search
 from holdfast.discovery.description import Description
 from holdfast.discovery.line_search import LINE_UNITS
-from holdfast.net.certificates import files
+from holdfast.runtime import whole_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -80,7 +80,7 @@ def _require_writable(file: Path, *, force: bool) -> None:
             raise click.UsageError(f"{file} exists; --force replaces it.")
         if file.is_dir():
             raise click.UsageError(f"{file} is a folder.")
-        files.try_replace(file)
+        whole_files.try_replace(file)
     except OSError as error:
         raise click.UsageError(f"{file} can't be written: {error.strerror}.") from error
 
@@ -308,7 +308,7 @@ class _Run:
                 f"{MAX_BYTES}: divide it, or describe it in parts, with --range or --areas"
             )
         try:
-            files.replace(path, data)
+            whole_files.replace(path, data)
         except OSError as error:
             self._fail_to_write(f"{path} can't be written: {error.strerror}")
             return ["", text]

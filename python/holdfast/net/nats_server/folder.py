@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from holdfast.events.file_lock import lock
-from holdfast.net.certificates.files import SECRET, replace
 from holdfast.net.nats_server.storage_limit import possible_limit
 from holdfast.net.secret_file import read_secret
+from holdfast.runtime.whole_files import SECRET, replace
 
 LEFT_OVER_END_TIMEOUT_S = 10.0
 """Seconds that a server which has lost its appliance has to end."""

@@ -1,8 +1,9 @@
-"""Writes certificates and keys."""
+"""Files that are written whole or not at all."""
 
 from __future__ import annotations
 
 import os
+import stat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -41,10 +42,24 @@ def write_new(contents: Mapping[Path, tuple[bytes, int]]) -> None:
         raise
 
 
-def replace(file: Path, content: bytes, mode: int = PUBLIC) -> None:
-    """Writes a file that programs may read at the same time. Raises `OSError`."""
-    new = _written_beside(file, content, mode)
+def replace(file: Path, content: bytes, mode: int | None = None) -> None:
+    """Writes a file that programs may read at the same time, and that a full disk leaves as it was.
+
+    Without `mode`, it keeps that of the file before. A pipe or a device is not replaced. Raises
+    `OSError`.
+    """
+    file = file.resolve()
     try:
+        before = file.stat().st_mode
+    except FileNotFoundError:
+        before = stat.S_IFREG | PUBLIC
+    if not stat.S_ISREG(before):
+        file.write_bytes(content)
+        return
+    new = _written_beside(file, content, PUBLIC if mode is None else mode)
+    try:
+        if mode is None:
+            new.chmod(stat.S_IMODE(before))
         new.replace(file)
     except BaseException:
         new.unlink(missing_ok=True)
@@ -53,7 +68,7 @@ def replace(file: Path, content: bytes, mode: int = PUBLIC) -> None:
 
 def try_replace(file: Path) -> None:
     """Raises `OSError` if the folder of a file does not allow `replace`. Changes nothing."""
-    _written_beside(file, b"", PUBLIC).unlink()
+    _written_beside(file.resolve(), b"", PUBLIC).unlink()
 
 
 def _written_beside(file: Path, content: bytes, mode: int) -> Path:
