@@ -189,6 +189,11 @@ READ = "which the configuration reads, allowed: another file"
             "2: memories.m.keep.file: found 'k', which is the file of outputs.o.buffer in line 3, "
             f"{OTHER}",
         ),
+        (
+            "memories: {m: {coils: 1, keep: {file: k}}, n: {coils: 1, keep: {file: folder/../k}}}",
+            "2: memories.n.keep.file: found 'folder/../k', which is the file of memories.m.keep in "
+            "line 2, allowed: the same text, to share it, or another file",
+        ),
         ("audit: {file: p.yaml}", f"2: audit.file: found 'p.yaml', {READ}"),
         (
             f"outputs: {{o: {csv('t')}, i: {{type: influx, url: 'http://h/w', token_file: t}}}}",

@@ -97,14 +97,22 @@ class Owners:
     """What the value is, as messages call it."""
     first: dict[object, KeyPath] = field(default_factory=dict)
 
-    def claim(self, path: KeyPath, value: object, shown: str, owner: KeyPath) -> None:
+    def claim(
+        self,
+        path: KeyPath,
+        value: object,
+        shown: str,
+        owner: KeyPath,
+        allowed: str = "a different one",
+    ) -> None:
         """Reports `value` at `path` if another owner has it; messages call it `shown`."""
         if value not in self.first:
             self.first[value] = owner
             return
         of = self.report.named(self.first[value])
-        message = f"found {shown}, which is the {self.what} of {of}, allowed: a different one"
-        self.report.add(path, message)
+        self.report.add(
+            path, f"found {shown}, which is the {self.what} of {of}, allowed: {allowed}"
+        )
 
 
 def unreadable(path: Path) -> str:

@@ -25,7 +25,7 @@ def check_written_files(scope: Scope) -> None:
     report, owners = scope.report, Owners(scope.report, "file")
     written = list(_written(scope.config))
     read = _read(scope) if written else set()
-    shared: set[tuple[str, Path]] = set()
+    shared: dict[tuple[str, str], Path] = {}
     for path, file, users in written:
         shown = show(report.raw(path))
         if reason := unplaceable(file, may_be_device=path[0] == "audit"):
@@ -35,10 +35,12 @@ def check_written_files(scope: Scope) -> None:
             note(path, f"found {shown}, {reason}, allowed: a file in an existing folder")
         elif (place := _place(file)) in read:
             report.add(path, f"found {shown}, which the configuration reads, allowed: another file")
-        elif (users, file) not in shared:
+        elif not users or (spelled := shared.setdefault((users, place), file)) is file:
             owners.claim(path, place, shown, path[:-1])
-        if users:
-            shared.add((users, file))
+        elif spelled != file:
+            owners.claim(
+                path, place, shown, path[:-1], "the same text, to share it, or another file"
+            )
 
 
 def _read(scope: Scope) -> set[str]:
