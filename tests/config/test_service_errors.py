@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import TYPE_CHECKING
 
 import pytest
@@ -141,6 +142,15 @@ def test_a_secret_in_the_place_of_its_hash_is_not_repeated(
     (problem,) = folder.problems(changed(REST, HASH, digest))
     quote = "" if found.startswith("text") else ", as text"
     assert problem == f"p.yaml:9: rest.tokens[0].sha256: found {found}, allowed: {DIGEST}{quote}"
+
+
+@pytest.mark.parametrize("text", [b"", b"\n"])
+def test_the_hash_of_nothing_is_that_of_no_token(folder: Folder, text: bytes) -> None:
+    digest = hashlib.sha256(text).hexdigest().upper()
+    assert folder.problems(changed(REST, HASH, digest)) == [
+        "p.yaml:9: rest.tokens[0].sha256: found the SHA-256 of an empty text, perhaps of an "
+        "unset variable, allowed: that of a token, as from `holdfast token`"
+    ]
 
 
 def test_a_number_in_the_place_of_a_hash_is_not_repeated(folder: Folder) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
 
 import holdfast
+from holdfast.net.http.bearer import owner
 from holdfast.net.http.fields import NotJson, decoded
 from holdfast.net.http.requests import BadRequest, ClientDisconnected, Headers, Request, Response
 from support import web
@@ -231,3 +233,11 @@ def test_json_is_decoded_as_it_is_written() -> None:
     found = decoded(text.encode())
     assert found == {"a": [1, 1.0, True, None, "\u00e9\U0001f600", 2**64]}
     assert [type(each) for each in found["a"][:3]] == [int, float, bool]
+
+
+@pytest.mark.parametrize("value", [b"Bearer", b"Bearer ", b"Bearer  \t"])
+def test_an_empty_token_is_nobodys_though_a_token_has_its_hash(value: bytes) -> None:
+    request = Request("GET", "/", b"", [(b"authorization", value)], "127.0.0.1:50000")
+    with pytest.raises(BadRequest, match="the token is empty") as caught:
+        owner(request, [("edge", hashlib.sha256(b"").digest())])
+    assert caught.value.reason == "unauthorized"

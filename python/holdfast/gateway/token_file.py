@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, TypeAlias
 
-from holdfast.config.values.scalars import NAME_FORM, is_name
+from holdfast.config.values.scalars import NAME_FORM, is_name, parse_token_hash
 from holdfast.net.secret_file import read_bytes
 
 if TYPE_CHECKING:
@@ -54,4 +54,4 @@ def _token(words: list[str], number: int) -> Token:
     name = names[0] if names else f"token-{number}"
     if not is_name(name):
         raise ValueError(f"the name of a token is {NAME_FORM}")
-    return name, bytes.fromhex(digest)
+    return name, bytes.fromhex(parse_token_hash(digest))

@@ -34,10 +34,10 @@ from holdfast.config.values.scalars import (
     OptionName,
     PollableEntry,
     QualityOfService,
-    Sha256,
     Sources,
     SubjectPrefix,
     SyslogUrl,
+    TokenHash,
     TopicFilter,
     TopicName,
     seconds,
@@ -76,7 +76,7 @@ class GatewayTokenConfig(Model):
 
     name: Name
     """The name of the token in logs; unique."""
-    sha256: Sha256
+    sha256: TokenHash
     """The SHA-256 of the token, 64 hexadecimal digits; the token itself is not in the file."""
 
 

@@ -6,6 +6,7 @@ express a rule in full, the type raises `ValueError` with its own message.
 
 from __future__ import annotations
 
+import hashlib
 import re
 import unicodedata
 from collections.abc import Callable
@@ -90,6 +91,9 @@ _WORD = r"([0-5]?[0-9]{1,4}|6([0-4][0-9]{3}|5([0-4][0-9]{2}|5([0-2][0-9]|3[0-5])
 RESERVED = ("rest", "mqtt", "nats", "gateway", "metrics")
 """Names that adapters can't have, because built-in services use them."""
 
+_HASHES_OF_NOTHING = {hashlib.sha256(text).hexdigest() for text in (b"", b"\n")}
+"""What `printf %s "$TOKEN" | sha256sum` and `echo` print if the variable is not set."""
+
 
 def is_name(value: object) -> TypeGuard[str]:
     """Whether the value is a valid name."""
@@ -141,6 +145,15 @@ def parse_sha256(value: object) -> str:
     quote = "" if isinstance(value, str) else ", as text"
     allowed = f"allowed: the SHA-256 of the token, 64 hexadecimal digits{quote}"
     raise ValueError(f"found {shape(value)}, {allowed}")
+
+
+def parse_token_hash(value: object) -> str:
+    """Checks the SHA-256 of a token, as `parse_sha256`."""
+    digest = parse_sha256(value)
+    if digest in _HASHES_OF_NOTHING:
+        found = "found the SHA-256 of an empty text, perhaps of an unset variable"
+        raise ValueError(f"{found}, allowed: that of a token, as from `holdfast token`")
+    return digest
 
 
 def _syslog_url(value: object) -> str:
@@ -422,7 +435,7 @@ DeviceName = Annotated[str, Parsed(_text_of(MAX_DEVICE), "/dev/ttyUSB0", "COM3",
 StatusName = Annotated[str, Parsed(_status_name, pattern=f"^{_STATUS_NAME}$")]
 MqttText = Annotated[str, Parsed(_text_of(MAX_TEXT), minLength=1, maxLength=MAX_TEXT)]
 FilePath = Annotated[Path, BeforeValidator(_in_folder, json_schema_input_type=str)]
-Sha256 = Annotated[str, Parsed(parse_sha256, pattern="^[0-9a-fA-F]{64}$")]
+TokenHash = Annotated[str, Parsed(parse_token_hash, pattern="^[0-9a-fA-F]{64}$")]
 BrokerUrl = Annotated[
     str, Parsed(_checked(parse_broker), "mqtt://127.0.0.1:1883", "mqtts://broker.example")
 ]

@@ -29,7 +29,10 @@ def owner(request: Request, tokens: Iterable[tuple[str, bytes]]) -> str:
     scheme, _, secret = found[0].partition(b" ")
     if scheme.lower() != b"bearer":
         raise BadRequest("unauthorized", "Authorization is not of the form Bearer TOKEN")
-    digest = hashlib.sha256(secret.strip()).digest()
+    secret = secret.strip()
+    if not secret:  # Whatever the hashes are, an unset variable is nobody's token.
+        raise BadRequest("unauthorized", "the token is empty")
+    digest = hashlib.sha256(secret).digest()
     name = None
     for each, known in tokens:  # Compares all of them, so the time reveals nothing.
         if hmac.compare_digest(known, digest):
