@@ -139,7 +139,10 @@ def test_a_right_to_restore_is_none_to_read(memory_access: MemoryAccess) -> None
         memory_access.follow("plant", [("coils", 0, 1)], GRANT, PEER)
 
 
-def test_a_range_that_mirrors_a_device_is_not_passed_on_to_it(plant: holdfast.Memory) -> None:
+@pytest.mark.parametrize("is_open", [False, True])
+def test_a_range_that_mirrors_a_device_is_not_passed_on_to_it(
+    plant: holdfast.Memory, is_open: bool
+) -> None:
     """The device is not under the lock of the seal, so the gate could open meanwhile."""
 
     class Passage:
@@ -150,11 +153,16 @@ def test_a_range_that_mirrors_a_device_is_not_passed_on_to_it(plant: holdfast.Me
             raise AssertionError("it is passed on")
 
     plant.mirror([("holding_registers", 0, 8)])
+    plant.write("discrete_inputs", 7, [is_open])
     passages = cast("Any", {"plant": Passage()})
     memory_access = MemoryAccess("mqtt", {"plant": plant}, passages=passages)
     with pytest.raises(Refused) as caught:
         memory_access.ingest(json.dumps(REGISTERS).encode(), GRANT, PEER)
-    assert caught.value.reason == "mirrored"
+    assert (caught.value.reason, caught.value.detail) == (
+        "not_granted",
+        "area holding_registers is granted to edge only while plant is sealed; "
+        "this write would go to drive",
+    )
 
 
 class OpeningAudit:

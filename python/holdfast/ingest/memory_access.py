@@ -435,15 +435,19 @@ class MemoryAccess:
     def _device(self, begun: Begun, refused: _core.BatchRefused) -> str:
         """The device that takes a write in place of a memory.
 
-        Raises `Refused` if there is none, and for a write that may be old: no stale command moves a
-        machine.
+        Raises `Refused` if there is none, for a write that is granted only while the memory is
+        sealed, and for one that may be old: no stale command moves a machine.
         """
         command = begun.batch[refused.command]
-        if begun.single and refused.reason == "mirrored" and command["area"] in begun.grant.areas:
+        if begun.single and refused.reason == "mirrored":
             passage = self._passages.get(command["memory"])
             count = len(values_of(command))
             device = passage and passage.device_of(command["area"], command["address"], count)
             if device is not None:
+                if command["area"] not in begun.grant.areas:
+                    detail = f"area {command['area']} is granted to {begun.grant.name} only while "
+                    detail += f"{command['memory']} is sealed; this write would go to {device}"
+                    raise Refused("not_granted", detail, **begun.where)
                 if begun.stale is None:
                     return device
                 detail = f"not sent to {device}: {begun.stale}"
