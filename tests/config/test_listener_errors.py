@@ -90,6 +90,13 @@ def test_a_listener_says_what_it_is(folder: Folder) -> None:
     ]
 
 
+def test_a_listener_has_no_name_of_a_service_in_logs(folder: Folder) -> None:
+    assert folder.problems(changed(UDP, "  udp:", "  rest:")) == [
+        "p.yaml:5: listeners.rest: found 'rest', allowed: a name other than rest, mqtt, nats, "
+        "gateway or metrics"
+    ]
+
+
 def test_a_listener_of_an_unknown_type_has_its_memories_checked(folder: Folder) -> None:
     text = changed(UDP, "modbus-udp", "udp").replace("{1: plant}", "{1: plan}")
     assert folder.problems(text) == [

@@ -464,7 +464,7 @@ def test_a_line_of_a_listener_or_a_device_is_not_polled_for_subscribers(folder: 
          f"5: hosts[0]: found '.plant', allowed: {HOST_NAME}"),
         ("  access", "  hosts: ['*']\n  access", f"5: hosts[0]: found '*', allowed: {HOST_NAME}"),
         ("  access", "  hosts: [7]\n  access", f"5: hosts[0]: found 7, allowed: {HOST_NAME}"),
-        ("panel", "''", f"7: tokens[0].name: found '', allowed: {NAME}"),
+        ("panel", "''", f"7: tokens[0].name: found '', allowed: {NAME}, not '-' alone"),
         ("    - name: panel\n      sha256", "    - sha256",
          "7: tokens[0].name: missing, allowed: text"),
         (HASH, "my-secret", "8: tokens[0].sha256: found text of 9 characters, allowed: the "

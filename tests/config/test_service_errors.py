@@ -43,6 +43,7 @@ metrics: {bind: 127.0.0.1:9464}
 audit: {file: audit.log}
 """
 NAME = "1 to 64 letters, digits, '_', '.' and '-'"
+TOKEN = f"{NAME}, not '-' alone"
 OTHER = "a name other than rest, mqtt, nats, gateway or metrics"
 SOME = "a list with at least one entry"
 DIGEST = "the SHA-256 of the token, 64 hexadecimal digits"
@@ -104,7 +105,8 @@ def test_listeners_are_not_empty_text(folder: Folder) -> None:
          "7: token: unknown key, allowed: bind, sources, tokens, max_body, max_connections, "
          "max_connections_per_source, when_full, request_timeout, tls, hosts; did you mean "
          "'tokens'?"),
-        ("name: edge", "name: ''", f"8: tokens[0].name: found '', allowed: {NAME}"),
+        ("name: edge", "name: ''", f"8: tokens[0].name: found '', allowed: {TOKEN}"),
+        ("name: edge", "name: '-'", f"8: tokens[0].name: found '-', allowed: {TOKEN}"),
         ("[plant]", "[]", f"10: tokens[0].memories: found an empty list, allowed: {SOME}"),
         ("[plant]", "[plan]", "10: tokens[0].memories[0]: found 'plan', allowed: plant, other; "
          "did you mean 'plant'?"),

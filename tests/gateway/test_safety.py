@@ -398,6 +398,7 @@ def test_a_token_line_shows_its_secret_once() -> None:
         (f"{SECRET}\n", ":1: no token"),
         ("a b " + "a" * 64, ":1: no token"),
         ("/x " + "a" * 64, "name"),
+        ("- " + "a" * 64, "name"),
         ("x " + hashlib.sha256(b"").hexdigest(), ":1: found the SHA-256 of an empty text"),
         ("x " + "a" * 64 + "\nx " + "b" * 64, ":2: duplicate name or token"),
         ("x " + "a" * 64 + "\ny " + "A" * 64, ":2: duplicate name or token"),

@@ -581,6 +581,14 @@ def test_same_names_in_two_listeners_are_two_memories(imported: Import) -> None:
     assert noted(found, "listeners[1].memory[0].name: changed: renamed to a-2")
 
 
+def test_names_with_a_meaning_in_logs_are_changed(imported: Import) -> None:
+    found = imported((SECOND % (RULE, "")).replace("main", "rest"))
+    assert list(found.data["listeners"]) == ["rest-2"]
+    assert noted(found, "changed: renamed to rest-2: the name has another meaning in logs")
+    text = (SEALED + REST % ("127.0.0.1:8080", "x" * 20)).replace("name: gate", "name: '-'")
+    assert imported(text).data["rest"]["tokens"][0]["name"] == "--2"
+
+
 @pytest.mark.parametrize("key", ["debug", "rbe", "notify", "persistence", "access_events"])
 def test_what_has_no_counterpart_is_noted_with_the_reason(imported: Import, key: str) -> None:
     found = imported(SECOND % (RULE, "") + f"{key}: true\n")

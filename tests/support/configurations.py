@@ -10,6 +10,7 @@ from holdfast.config.values.scalars import RESERVED
 from support.paths import EXAMPLES
 
 NAMES = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)
+UNRESERVED = NAMES.filter(lambda name: name not in RESERVED)
 TEXTS = st.text(st.characters(exclude_categories=("Cc", "Cs")), min_size=1, max_size=60)
 SPANS = st.integers(0, 65535).flatmap(
     lambda start: st.integers(1, 65536 - start).map(lambda size: {"start": start, "size": size})
@@ -165,7 +166,7 @@ def grants(memories: list[str]) -> dict[str, st.SearchStrategy[Any]]:
 
 def tokens(**more: st.SearchStrategy[Any]) -> st.SearchStrategy[list[dict[str, Any]]]:
     return st.lists(
-        st.fixed_dictionaries({"name": NAMES, "sha256": HASHES, **more}),
+        st.fixed_dictionaries({"name": NAMES.filter("-".__ne__), "sha256": HASHES, **more}),
         min_size=1,
         max_size=3,
         unique_by=(lambda t: t["name"], lambda t: t["sha256"].lower()),
@@ -251,8 +252,7 @@ def adapters(memories: list[str]) -> st.SearchStrategy[dict[str, Any]]:
         {"type": NAMES, **grants(memories), "access": ACCESS},
         optional={"options": st.dictionaries(TEXTS, OPTIONS, max_size=3)},
     )
-    names = NAMES.filter(lambda name: name not in RESERVED)
-    return st.dictionaries(names, adapter, max_size=2)
+    return st.dictionaries(UNRESERVED, adapter, max_size=2)
 
 
 PLACES = st.sampled_from(
@@ -371,7 +371,7 @@ def configurations(draw: st.DrawFn) -> dict[str, Any]:
     kinds = [connections, secure, datagrams, lines, raw_ingest]
     listeners = {
         name: draw(draw(st.sampled_from(kinds))(names, 5000 + index))
-        for index, name in enumerate(draw(st.lists(NAMES, max_size=3, unique=True)))
+        for index, name in enumerate(draw(st.lists(UNRESERVED, max_size=3, unique=True)))
     }
     optional = {
         "rest": rest(names),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, TypeAlias
 
-from holdfast.config.values.scalars import NAME_FORM, is_name, parse_token_hash
+from holdfast.config.values.scalars import TOKEN_NAME_FORM, is_token_name, parse_token_hash
 from holdfast.net.secret_file import read_bytes
 
 if TYPE_CHECKING:
@@ -52,6 +52,6 @@ def _token(words: list[str], number: int) -> Token:
     if len(names) > 1 or not _HASH.fullmatch(digest):
         raise ValueError(f"no token, allowed: {FORM}")
     name = names[0] if names else f"token-{number}"
-    if not is_name(name):
-        raise ValueError(f"the name of a token is {NAME_FORM}")
+    if not is_token_name(name):
+        raise ValueError(f"the name of a token is {TOKEN_NAME_FORM}")
     return name, bytes.fromhex(parse_token_hash(digest))

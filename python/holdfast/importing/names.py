@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from holdfast.config.values.scalars import NAME_FORM
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
 
     from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.notes import Desk
@@ -16,17 +16,25 @@ if TYPE_CHECKING:
 MAX_LENGTH = 64
 
 
-def unique_names(desk: Desk, wanted: Sequence[tuple[KeyPath, str]]) -> list[str]:
-    """A unique, allowed name for each wanted name; keeps wanted names where possible."""
+def unique_names(
+    desk: Desk, wanted: Sequence[tuple[KeyPath, str]], reserved: Collection[str] = ()
+) -> list[str]:
+    """A unique, allowed name for each wanted name; keeps wanted names where possible.
+
+    `reserved` are names that none may have.
+    """
     texts = [text for _, text in wanted]
-    taken = {text for text in texts if _allowed(text) == text}
+    kept = {text for text in texts if _allowed(text) == text}.difference(reserved)
+    taken = kept.union(reserved)
     given: list[str] = []
     for index, (path, text) in enumerate(wanted):
         name = text
-        if text not in taken or text in texts[:index]:
+        if text not in kept or text in texts[:index]:
             name = free_name(_allowed(text), taken)
             taken.add(name)
             reason = "the name is in use" if text in texts[:index] else f"a name has {NAME_FORM}"
+            if text in reserved:
+                reason = "the name has another meaning in logs"
             desk.changed(path, f"renamed to {name}: {reason}")
         given.append(name)
     return given

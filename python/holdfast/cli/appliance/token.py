@@ -10,7 +10,7 @@ import click
 from holdfast.cli.options.option import flag, json_option, option
 from holdfast.cli.terminal_text import print_json
 from holdfast.config.dump import on_one_line
-from holdfast.config.values.scalars import NAME_FORM, is_name
+from holdfast.config.values.scalars import TOKEN_NAME_FORM, is_token_name
 
 SECRET_BYTES = 32
 
@@ -39,8 +39,10 @@ def token(name: str, gateway: bool, line: bool, as_json: bool) -> None:
     """
     if gateway + line + as_json > 1:
         raise click.UsageError("--gateway, --line and --json can't be used together.")
-    if not is_name(name):
-        raise click.BadParameter(f"found {name!r}, allowed: {NAME_FORM}", param_hint="'--name'")
+    if not is_token_name(name):
+        raise click.BadParameter(
+            f"found {name!r}, allowed: {TOKEN_NAME_FORM}", param_hint="'--name'"
+        )
     secret = secrets.token_urlsafe(SECRET_BYTES)
     digest = hashlib.sha256(secret.encode()).hexdigest()
     if as_json:

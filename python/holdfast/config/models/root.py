@@ -31,16 +31,16 @@ from holdfast.config.models.services import (
 )
 from holdfast.config.models.tags import ProfileConfig
 from holdfast.config.values.scalars import (
-    ADAPTER_KEYS,
     NAME_KEYS,
     OBJECT_KEYS,
     UNIT_KEYS,
-    AdapterName,
+    UNRESERVED_KEYS,
     Name,
     NotNull,
     ObjectId,
     Text,
     UnitId,
+    UnreservedName,
 )
 from holdfast.config.values.template_schema import with_templates
 from holdfast.events import FORMAT, LEVEL, Format, Level
@@ -116,8 +116,8 @@ class Config(Model):
     """Logs of writes that several appliances share, by name."""
     identity: IdentityConfig = Field(default_factory=IdentityConfig)
     """The identification of the appliance."""
-    listeners: dict[Name, Annotated[Listener, Field(discriminator="type")]] = Field(
-        default={}, json_schema_extra=NAME_KEYS
+    listeners: dict[UnreservedName, Annotated[Listener, Field(discriminator="type")]] = Field(
+        default={}, json_schema_extra=UNRESERVED_KEYS
     )
     """The servers, by name; optional with rest, mqtt, nats, gateway or a device."""
     profiles: Profiles = Field(default={}, json_schema_extra=NAME_KEYS)
@@ -134,11 +134,13 @@ class Config(Model):
     """The scanner, which polls devices for NATS subscribers."""
     gateway: Annotated[GatewayConfig | None, NotNull()] = None
     """The gateway, which gives access to devices over HTTP and has a web console."""
-    outputs: dict[AdapterName, Annotated[Output, Field(discriminator="type")]] = Field(
-        default={}, json_schema_extra=ADAPTER_KEYS
+    outputs: dict[UnreservedName, Annotated[Output, Field(discriminator="type")]] = Field(
+        default={}, json_schema_extra=UNRESERVED_KEYS
     )
     """Where the values of tags are published, by name."""
-    adapters: dict[AdapterName, AdapterConfig] = Field(default={}, json_schema_extra=ADAPTER_KEYS)
+    adapters: dict[UnreservedName, AdapterConfig] = Field(
+        default={}, json_schema_extra=UNRESERVED_KEYS
+    )
     """Third-party adapters, by name."""
     metrics: Annotated[MetricsConfig | None, NotNull()] = None
     """Metrics for Prometheus."""

@@ -38,6 +38,7 @@ from holdfast.config.values.scalars import (
     SubjectPrefix,
     SyslogUrl,
     TokenHash,
+    TokenName,
     TopicFilter,
     TopicName,
     seconds,
@@ -74,7 +75,7 @@ from holdfast.types import Access
 class GatewayTokenConfig(Model):
     """A secret token that gives access to the gateway."""
 
-    name: Name
+    name: TokenName
     """The name of the token in logs; unique."""
     sha256: TokenHash
     """The SHA-256 of the token, 64 hexadecimal digits; the token itself is not in the file."""

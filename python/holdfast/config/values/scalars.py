@@ -73,6 +73,7 @@ MIN_TIME = 0.001
 NOT_ON_A_LINE = f"; 0 is the broadcast, {MAX_SERIAL_UNIT + 1} to {MAX_UNIT} are reserved"
 MAX_SPARKPLUG_ID = 255
 NAME_FORM = "1 to 64 letters, digits, '_', '.' and '-'"
+TOKEN_NAME_FORM = f"{NAME_FORM}, not '-' alone"
 _POINT_FORM = (
     "without control characters, and without a backslash at its end or before a blank, comma, =, "
     '" or \\'
@@ -80,6 +81,7 @@ _POINT_FORM = (
 POINT_TAG_FORM = f"text {_POINT_FORM}"
 MEASUREMENT_FORM = f"text that does not begin with #, {_POINT_FORM}"
 _NAME = r"[A-Za-z0-9_.-]{1,64}"
+_TOKEN_NAME = f"(?!-$){_NAME}"
 _POINT_TAG = r'([^\\\x00-\x1f]|\\[^ ,="\\\x00-\x1f])+'
 _MEASUREMENT = f"(?!#){_POINT_TAG}"
 _STATUS_NAME = "[ -~]{0,16}"
@@ -89,7 +91,7 @@ _SERIAL = r"([1-9]|[1-9][0-9]|1[0-9][0-9]|2[0-3][0-9]|24[0-7])"
 _WORD = r"([0-5]?[0-9]{1,4}|6([0-4][0-9]{3}|5([0-4][0-9]{2}|5([0-2][0-9]|3[0-5]))))"
 
 RESERVED = ("rest", "mqtt", "nats", "gateway", "metrics")
-"""Names that adapters can't have, because built-in services use them."""
+"""Names of built-in services in logs, which listeners, outputs and adapters can't have."""
 
 _HASHES_OF_NOTHING = {hashlib.sha256(text).hexdigest() for text in (b"", b"\n")}
 """What `printf %s "$TOKEN" | sha256sum` and `echo` print if the variable is not set."""
@@ -104,6 +106,17 @@ def _name(value: object) -> str:
     if is_name(value):
         return value
     raise ValueError(f"found {show(value)}, allowed: {NAME_FORM}{_quotable(value)}")
+
+
+def is_token_name(value: object) -> TypeGuard[str]:
+    """Whether the value is a valid name of a token; logs have `-` for requests without one."""
+    return is_name(value) and value != "-"
+
+
+def _token_name(value: object) -> str:
+    if is_token_name(value):
+        return value
+    raise ValueError(f"found {show(value)}, allowed: {TOKEN_NAME_FORM}{_quotable(value)}")
 
 
 def _raw_target(value: object) -> str:
@@ -126,7 +139,7 @@ def _id_of(what: str, least: int, most: int) -> Callable[[object], int]:
     return number
 
 
-def _adapter_name(value: object) -> str:
+def _unreserved_name(value: object) -> str:
     if value in RESERVED:
         raise ValueError(f"found {show(value)}, allowed: a name other than {either(RESERVED)}")
     return _name(value)
@@ -413,7 +426,8 @@ class Parsed:
 Name = Annotated[str, Parsed(_name, pattern=f"^{_NAME}$")]
 RawTarget = Annotated[str, Parsed(_raw_target, pattern=f"^{_NAME}$")]
 """The memory behind a unit id of raw ingest packets."""
-AdapterName = Annotated[str, Parsed(_adapter_name, pattern=f"^{_NAME}$")]
+UnreservedName = Annotated[str, Parsed(_unreserved_name, pattern=f"^{_NAME}$")]
+TokenName = Annotated[str, Parsed(_token_name, pattern=f"^{_TOKEN_NAME}$")]
 OptionName = Annotated[str, Parsed(_option_name)]
 UnitId = Annotated[
     int, Parsed(_id_of("a unit id", 0, MAX_UNIT), type="integer", minimum=0, maximum=MAX_UNIT)
@@ -528,7 +542,7 @@ RAW_UNIT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_WORD}$"}}
 FILE_KEYS: JsonDict = {"propertyNames": {"pattern": f"^(?!0$){_WORD}$"}}
 PEER_KEYS: JsonDict = {"propertyNames": {"pattern": "^[0-9a-fA-F.:]+$"}}
 OBJECT_KEYS: JsonDict = {"propertyNames": {"pattern": f"^{_HIGH_BYTE}$"}}
-ADAPTER_KEYS: JsonDict = {
+UNRESERVED_KEYS: JsonDict = {
     "propertyNames": {"pattern": f"^{_NAME}$", "not": {"enum": list(RESERVED)}}
 }
 """JSON Schema patterns for the keys of mappings, which JSON Schema treats as text."""

@@ -191,7 +191,7 @@ class Adapters(Reader):
             found[digest] = (rest.path, "published")
             message = "the token of the documentation that the source always accepted is kept"
             self.desk.check(rest.path, f"{message}, as published; everybody knows it")
-        names = unique_names(self.desk, list(found.values()))
+        names = unique_names(self.desk, list(found.values()), ("-",))
         grant: dict[str, Any] = {
             **self.draft.ingest_grant(self.choices.grant_rest),
             "access": "read-write",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from holdfast.config.values.scalars import RESERVED
 from holdfast.importing.key_reader import Section, section
 from holdfast.importing.mma import function_rights as functions
 from holdfast.importing.mma.address_filters import ALL, read_networks
@@ -59,7 +60,7 @@ class SecondGeneration(Reader):
             (one.at("id"), one.name("id", required=True) or f"listener-{number}")
             for number, one in enumerate(listeners, 1)
         ]
-        names = unique_names(self.desk, wanted)
+        names = unique_names(self.desk, wanted, RESERVED)
         memories = [self._memories(one) for one in listeners]
         self._name(list(zip(names, memories, strict=True)))
         for name, listener, own in zip(names, listeners, memories, strict=True):
