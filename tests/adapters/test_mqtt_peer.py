@@ -544,7 +544,7 @@ def ask(number: int, qos: int = 0, topic: str = "answers") -> bytes:
     )
 
 
-@pytest.mark.parametrize("topic", ["", "#", "a/+", "a#", "a\0b", "plant/ingest"])
+@pytest.mark.parametrize("topic", ["", "#", "a/+", "a#", "a\0b", "$SYS/a", "plant/ingest"])
 def test_a_response_topic_that_cannot_be_is_dropped(
     rig: Rig, fake5: FakeBroker, topic: str
 ) -> None:
@@ -557,6 +557,21 @@ def test_a_response_topic_that_cannot_be_is_dropped(
 
     assert running.status()["answers_dropped"] == 1
     assert rig.registers(0, 1) == [1]
+
+
+@pytest.mark.parametrize("qos", [0, 1])
+def test_a_connection_that_the_broker_ends_after_an_answer_is_logged_with_its_topic(
+    rig: Rig, fake5: FakeBroker, monkeypatch: pytest.MonkeyPatch, qos: int
+) -> None:
+    monkeypatch.setattr(connection, "JUST_NOW_S", wire.DEADLINE)
+    running = run(rig, fake5)
+    with fake5.accept() as peer:
+        peer.welcome()
+        peer.send(ask(1, qos, "forbidden/me"))
+        while peer.receive().kind != mqtt.PUBLISH:
+            pass
+    wire.until(lambda: running.status()["last_error"] is not None, "it ended")
+    assert str(running.status()["last_error"]).endswith(", soon after a reply to 'forbidden/me'")
 
 
 def test_an_answer_comes_after_the_acknowledgement(rig: Rig, fake5: FakeBroker) -> None:

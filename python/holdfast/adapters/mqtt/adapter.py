@@ -21,6 +21,7 @@ from holdfast.net.mqtt.dial import CONNACK_TIMEOUT_S
 from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secure_channel import failure_text
 from holdfast.runtime.backoff import Backoff
+from holdfast.runtime.text import quote
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Set
@@ -165,6 +166,8 @@ class Mqtt:
         if reason != "stopped":
             if began is not None and link is not None:
                 reason = self._client_id.explained(reason, link)
+                if link.trouble is None and (topic := link.topic_answered_just_now) is not None:
+                    reason += f", soon after a reply to {quote(topic)}"
             self._last_error = reason
         if began is not None:
             level = logging.INFO if reason == "stopped" else logging.WARNING

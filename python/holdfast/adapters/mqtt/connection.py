@@ -24,7 +24,7 @@ from holdfast.net.mqtt.packets import MAX_HEAD_BYTES, acknowledgement, parse_pub
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from paho.mqtt.client import Client
+    from paho.mqtt.client import Client, MQTTMessageInfo
     from paho.mqtt.properties import Properties
     from paho.mqtt.reasoncodes import ReasonCode
 
@@ -38,6 +38,9 @@ MAX_UNSENT_PACKETS = 1000
 
 _MAX_UNACKNOWLEDGED = 20
 """Limit of answers that are sent and not acknowledged; further answers wait."""
+
+JUST_NOW_S = 5.0
+"""Seconds after an answer, in which a broker ends the connection if it forbids the topic."""
 
 _READ_BYTES = 65_536
 
@@ -74,6 +77,8 @@ class BrokerConnection(BrokerClient):
         self._on_the_way: set[int] = set()
         self._waiting: deque[tuple[str, bytes, Properties]] = deque()
         """Topic, payload and properties of answers that wait until others are acknowledged."""
+        self._answered: tuple[str, float] | None = None
+        """The topic of the last answer that was published, and when."""
         self.on_publish = self._send_waiting
 
     @property
@@ -102,10 +107,17 @@ class BrokerConnection(BrokerClient):
         """Answers that wait for an acknowledgement, or for that of others."""
         return len(self._on_the_way) + len(self._waiting)
 
+    @property
+    def topic_answered_just_now(self) -> str | None:
+        """The topic of an answer that was published only just; the broker may forbid it."""
+        if self._answered is None or time.monotonic() > self._answered[1] + JUST_NOW_S:
+            return None
+        return self._answered[0]
+
     def answer(self, topic: str, payload: bytes, qos: int, properties: Properties) -> None:
         """Publishes a message, with QoS 1 when the broker has acknowledged others."""
         if not qos:
-            self.publish(topic, payload, 0, properties=properties)
+            self._publish_answer(topic, payload, 0, properties)
             return
         self._waiting.append((topic, payload, properties))
         self._send_waiting()
@@ -122,8 +134,14 @@ class BrokerConnection(BrokerClient):
         self._on_the_way.discard(identifier)
         while self._waiting and len(self._on_the_way) < self._most_on_the_way:
             topic, payload, properties = self._waiting.popleft()
-            sent = self.publish(topic, payload, 1, properties=properties)
+            sent = self._publish_answer(topic, payload, 1, properties)
             self._on_the_way.add(sent.mid)
+
+    def _publish_answer(
+        self, topic: str, payload: bytes, qos: int, properties: Properties
+    ) -> MQTTMessageInfo:
+        self._answered = topic, time.monotonic()
+        return self.publish(topic, payload, qos, properties=properties)
 
     def read_more(self) -> None:
         """Reads and handles what has arrived, while the broker takes the answers."""

@@ -86,12 +86,16 @@ class Publish(NamedTuple):
 
     @property
     def answer_topic(self) -> str | None:
-        """The response topic as text; `None` without one to which a message can be published."""
+        """The response topic as text; `None` without one to which a message can be published.
+
+        Topics that begin with `$` are the broker's own (MQTT 5, 4.7.2).
+        """
         try:
             topic = (self.response_topic or b"").decode()
         except UnicodeDecodeError:
             return None
-        return topic if topic and not set(topic) & set("+#\0") else None
+        is_usable = topic and not topic.startswith("$") and not set(topic) & set("+#\0")
+        return topic if is_usable else None
 
 
 def parse_publish(flags: int, body: bytes | bytearray, length: int, *, five: bool) -> Publish:
