@@ -385,16 +385,41 @@ def test_a_device_to_which_no_connection_can_be_made_is_exception_10(
 def test_a_sealed_memory_passes_nothing_on(run: Run, caplog: pytest.LogCaptureFixture) -> None:
     with plc() as source:
         meter = device(source.url, *READS, **RARELY)
-        text = configuration({"meter": meter}, **MORE)
-        sealed = text.replace('"coils":', '"seal": {"area": "coils", "address": 0}, "coils":', 1)
-        assert sealed != text
-        appliance = run(sealed)
+        appliance = run(with_seal(configuration({"meter": meter}, **MORE), 0))
         until_read(appliance)
         with client(appliance) as scada, refused_with(6):
             scada.write_register(11, 7)
         assert writes_of(source) == []
         log_events(appliance)
         assert caplog.messages.count("refused_sealed") == 1
+
+
+def with_seal(text: str, address: int) -> str:
+    seal = {"area": "coils", "address": address, "mode": "level"}
+    sealed = text.replace('"coils":', f'"seal": {json.dumps(seal)}, "coils":', 1)
+    assert sealed != text
+    return sealed
+
+
+def test_modbus_passes_no_write_of_the_gate_bit_on(run: Run) -> None:
+    with plc() as source:
+        source.model.values["coils"][3] = 1
+        meter = device(source.url, *READS, **RARELY)
+        appliance = run(with_seal(configuration({"meter": meter}, **MORE), 103))
+        until_read(appliance)
+        assert not appliance.memories["mirror"].sealed
+        with client(appliance) as scada:
+            for value in (False, True):
+                with refused_with(2):
+                    scada.write_coil(103, value)
+                with refused_with(2):
+                    scada.write_coils(102, [True, value, True])
+            scada.write_coil(104, True)
+        assert writes_of(source) == [b"\x05\x00\x04\xff\x00"]
+        rest = web.Client(endpoint(appliance, "rest"))
+        with contextlib.closing(rest):
+            assert rest.ingest(web.command("coils", 103, [0], "mirror")).status == 200
+        assert appliance.memories["mirror"].sealed
 
 
 def test_a_read_that_takes_several_requests_keeps_what_was_written_meanwhile(run: Run) -> None:

@@ -3,7 +3,7 @@
 use crate::area::{Area, Layout};
 use crate::bits;
 use crate::error::Refusal;
-use crate::operation::{Access, Write};
+use crate::operation::Access;
 
 /// When the gate bit opens the seal.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -23,12 +23,16 @@ pub struct Gate {
 }
 
 impl Gate {
-    /// Whether an access may write these addresses: clients can't open the memory.
+    /// Whether an access may write a range: clients can't open the memory.
     #[inline]
-    pub(crate) fn admit_write(self, access: Access, write: &Write<'_>) -> Result<(), Refusal> {
-        let start = usize::from(write.address);
-        let is_in = self.area == write.area
-            && (start..start + write.count).contains(&usize::from(self.address));
+    pub(crate) fn admit_write(
+        self,
+        access: Access,
+        (area, address, count): (Area, u16, usize),
+    ) -> Result<(), Refusal> {
+        let start = usize::from(address);
+        let is_in =
+            self.area == area && (start..start + count).contains(&usize::from(self.address));
         if is_in && access == Access::Client { Err(Refusal::GateBit) } else { Ok(()) }
     }
 

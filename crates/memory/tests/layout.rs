@@ -163,6 +163,8 @@ fn a_client_never_writes_the_gate_bit_alone_or_as_the_first_or_last_of_others() 
         let done = write(Access::Client, address, count, &bytes[..count.div_ceil(8)]);
         let expected = if refused { Err(Refusal::GateBit) } else { Ok(()) };
         assert_eq!(done, expected, "{address} {count}");
+        let passed = memory.check_passed(Access::Client, (Area::Coils, address, count));
+        assert_eq!(passed, expected, "{address} {count}");
     }
 }
 

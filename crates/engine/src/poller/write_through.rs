@@ -109,15 +109,11 @@ impl Passage {
     /// Sends such a request of a client on its way. Returns the name of the device too.
     ///
     /// # Errors
-    /// The exception to refuse it with: the memory is sealed, the request touches more than one range,
-    /// too many wait, or the poller has stopped.
+    /// The exception to refuse it with: the memory is sealed, the request writes the gate bit or touches
+    /// more than one range, too many wait, or the poller has stopped.
     pub(crate) fn ask(&self, pdu: &[u8]) -> Result<(Arc<str>, PendingReply), ExceptionCode> {
-        Request::parse(pdu)?;
-        if self.memory.sealed() {
-            return Err(ExceptionCode::ServerDeviceBusy);
-        }
         let (reply, pending) = pending_reply();
-        let device = self.pass(pdu, Receiver::Client(reply))?;
+        let device = self.pass(Access::Client, pdu, Receiver::Client(reply))?;
         Ok((device, pending))
     }
 
@@ -135,7 +131,8 @@ impl Passage {
     pub fn write(&self, request: &Request<'_>) -> Result<(), u8> {
         let encoded = EncodedRequest::new(request);
         let (reply, pending) = pending_reply();
-        self.pass(encoded.pdu(), Receiver::Client(reply)).map_err(ExceptionCode::code)?;
+        self.pass(Access::Ingest, encoded.pdu(), Receiver::Client(reply))
+            .map_err(ExceptionCode::code)?;
         match pending.wait() {
             Ok(reply) => exception_in(&reply.pdu).map_or(Ok(()), Err),
             Err(_) => Err(ExceptionCode::GatewayPathUnavailable.code()),
@@ -147,14 +144,15 @@ impl Passage {
         let encoded = EncodedRequest::new(request);
         let (ticket, waiting) = caller.begin(&encoded, Duration::MAX, false);
         // What is refused here ends as lost, and was not sent.
-        let _ = self.pass(encoded.pdu(), Receiver::EventLoop(waiting));
+        let _ = self.pass(Access::Ingest, encoded.pdu(), Receiver::EventLoop(waiting));
         ticket
     }
 
-    fn pass(&self, pdu: &[u8], reply: Receiver) -> Result<Arc<str>, ExceptionCode> {
+    fn pass(&self, access: Access, pdu: &[u8], reply: Receiver) -> Result<Arc<str>, ExceptionCode> {
         let request = Request::parse(pdu)?;
         let (read, written) = touched(&request);
         let written = written.ok_or(ExceptionCode::IllegalFunction)?;
+        admit(&self.memory, access, written)?;
         let is_whole = |range: &&PassedRange| {
             let range = range.items();
             written.is_in(range) && read.is_none_or(|read| read.is_in(range))
@@ -177,6 +175,16 @@ impl Passage {
         sent.or(Err(ExceptionCode::GatewayPathUnavailable))?;
         Ok(Arc::clone(&range.device))
     }
+}
+
+/// Whether a memory lets these items be changed in the device.
+fn admit(memory: &Memory, access: Access, written: Items) -> Result<(), ExceptionCode> {
+    let Items { area, address, count } = written;
+    let checked = memory.check_passed(access, (area, address, count as usize));
+    checked.map_err(|refusal| match refusal {
+        Refusal::Sealed => ExceptionCode::ServerDeviceBusy,
+        _ => ExceptionCode::IllegalDataAddress,
+    })
 }
 
 /// The request with the addresses of the device.

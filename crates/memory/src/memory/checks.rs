@@ -74,10 +74,24 @@ impl Memory {
             return Err(Refusal::WrongLength);
         }
         self.layout.offset(area, address, count).ok_or(Refusal::OutOfRange)?;
-        if let Some(gate) = self.gate {
-            gate.admit_write(access, write)?;
-        }
+        self.admit_at_gate(access, (area, address, count))?;
         self.unreserved(access, area, address, count, ranges)
+    }
+
+    /// Checks what of a write does not depend on who carries it out, for one that a device carries out in
+    /// place of the memory.
+    ///
+    /// # Errors
+    /// [`Refusal::Sealed`] or [`Refusal::Unsealed`], then [`Refusal::GateBit`].
+    pub fn check_passed(&self, access: Access, range: (Area, u16, usize)) -> Result<(), Refusal> {
+        self.shared().admit(access)?;
+        self.admit_at_gate(access, range)
+    }
+
+    /// Checks whether a range may be written, as far as the gate bit is concerned.
+    #[inline]
+    fn admit_at_gate(&self, access: Access, range: (Area, u16, usize)) -> Result<(), Refusal> {
+        self.gate.map_or(Ok(()), |gate| gate.admit_write(access, range))
     }
 
     /// Checks a mask write, without the lock. Returns the offset of the register.
