@@ -158,20 +158,31 @@ fn ask(client: &mut TcpStream, bytes: &[u8]) -> Vec<u8> {
 }
 
 #[test]
-fn a_connection_is_not_given_the_targets_of_another_format() {
+fn a_connection_does_not_go_on_where_packets_have_another_dialect() {
     type Kinds = fn(RawSettings) -> ListenerKind;
     let shared: Kinds = |raw| ListenerKind::ModbusStream(stream(&memory(), Some(raw)));
+    let (strict, close) = (Flags::Strict, AfterRefusal::Close);
+    let many = PacketsPerConnection::Many { idle: TIMEOUT, after_refusal: close };
     for kind in [ListenerKind::RawIngest, shared] {
-        for (format, other) in [(V1, CRC), (CRC, V1)] {
+        for (before, after) in [
+            ((V1, strict, MANY), (CRC, strict, MANY)),
+            ((CRC, strict, MANY), (V1, strict, MANY)),
+            ((CRC, Flags::Ignore, MANY), (CRC, strict, MANY)),
+            ((CRC, strict, MANY), (CRC, strict, many)),
+            ((CRC, strict, many), (CRC, strict, PacketsPerConnection::One)),
+        ] {
             let (first, second) = (memory(), memory());
-            let engine = engine(vec![("raw", kind(raw(&first, format, MANY)))]);
+            let raw = |memory, (format, flags, packets)| {
+                vec![("raw", kind(RawSettings { flags, ..raw(memory, format, packets) }))]
+            };
+            let engine = engine(raw(&first, before));
             let mut client = served(&engine);
-            assert_eq!(ask(&mut client, &packet(format)), [DONE]);
-            engine.reload(listening(vec![("raw", kind(raw(&second, other, MANY)))])).unwrap();
-            assert_eq!(ask(&mut client, &packet(format)), NO_REPLY);
+            assert_eq!(ask(&mut client, &packet(before.0)), [DONE]);
+            engine.reload(listening(raw(&second, after))).unwrap();
+            assert_eq!(ask(&mut client, &packet(before.0)), NO_REPLY);
             assert_eq!((register(&first), register(&second), revoked(&engine)), (7, 0, 1));
             let mut next = connect(engine.addresses()[0].unwrap());
-            assert_eq!((ask(&mut next, &packet(other)), register(&second)), (vec![DONE], 7));
+            assert_eq!((ask(&mut next, &packet(after.0)), register(&second)), (vec![DONE], 7));
         }
     }
 }

@@ -108,10 +108,19 @@ pub enum AfterRefusal {
     Continue,
 }
 
+/// What a listener takes for a packet, and what may follow it. A connection keeps it to its end.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Dialect {
+    /// Decides also what the numbers of the targets mean.
+    format: Format,
+    flags: Flags,
+    /// `None` if a connection carries one packet.
+    after_refusal: Option<AfterRefusal>,
+}
+
 #[derive(Debug)]
 pub(crate) struct RawGrant {
-    /// Decides what the numbers of the targets mean.
-    format: Format,
+    dialect: Dialect,
     targets: HashMap<u16, Arc<Memory>>,
     areas: Vec<Area>,
 }
@@ -121,11 +130,10 @@ pub(crate) struct RawIngest {
     pub(crate) packets: Arc<PacketCounters>,
     policy: Grants<RawGrant>,
     tls: Option<Arc<ServerTls>>,
-    format: Format,
-    flags: Flags,
+    dialect: Dialect,
     request_timeout: Duration,
-    many: Option<Duration>,
-    after_refusal: AfterRefusal,
+    /// The longest time without a packet, of a connection that carries many.
+    idle: Duration,
 }
 
 /// The state of a packet that is being received.
@@ -214,34 +222,32 @@ pub(crate) type Renewal = Box<dyn Fn() -> Option<Arc<RawGrant>> + Send + Sync>;
 
 impl RawIngest {
     pub(crate) fn new(settings: &RawSettings, packets: Arc<PacketCounters>) -> RawIngest {
+        let (idle, after_refusal) = match settings.packets {
+            PacketsPerConnection::One => (Duration::ZERO, None),
+            PacketsPerConnection::Many { idle, after_refusal } => (idle, Some(after_refusal)),
+        };
+        let dialect = Dialect { format: settings.format, flags: settings.flags, after_refusal };
         let rules = settings.rules.iter().map(|rule| {
             let targets = rule.targets.iter().cloned().collect();
-            let (format, areas) = (settings.format, rule.areas.clone());
-            let rights = Arc::new(RawGrant { format, targets, areas });
+            let rights = Arc::new(RawGrant { dialect, targets, areas: rule.areas.clone() });
             PolicyEntry { sources: rule.sources.clone(), roles: rule.roles.clone(), rights }
         });
-        let nobody =
-            RawGrant { format: settings.format, targets: HashMap::new(), areas: Vec::new() };
-        let (many, after_refusal) = match settings.packets {
-            PacketsPerConnection::One => (None, AfterRefusal::Close),
-            PacketsPerConnection::Many { idle, after_refusal } => (Some(idle), after_refusal),
-        };
+        let nobody = RawGrant { dialect, targets: HashMap::new(), areas: Vec::new() };
         RawIngest {
             packets,
             policy: Grants { entries: rules.collect(), nobody: Arc::new(nobody) },
             tls: settings.tls.clone(),
-            format: settings.format,
-            flags: settings.flags,
+            dialect,
             request_timeout: settings.request_timeout,
-            many,
-            after_refusal,
+            idle,
         }
     }
 
     fn header(&self, bytes: &[u8]) -> Result<Option<Header>, Refusal> {
-        match self.flags {
-            Flags::Strict => self.format.header(bytes),
-            Flags::Ignore => self.format.header_with_any_flags(bytes),
+        let Dialect { format, flags, .. } = self.dialect;
+        match flags {
+            Flags::Strict => format.header(bytes),
+            Flags::Ignore => format.header_with_any_flags(bytes),
         }
     }
 
@@ -335,14 +341,15 @@ impl RawIngest {
 
     /// Checks the bytes received so far, up to the end of the first packet.
     fn judge<'p>(&self, rights: &'p RawGrant, bytes: &'p [u8]) -> Result<Packet<'p>, Refusal> {
+        let format = self.dialect.format;
         let Some(header) = self.header(bytes)? else {
-            let missing = self.format.header_len().saturating_sub(bytes.len()).max(1);
+            let missing = format.header_len().saturating_sub(bytes.len()).max(1);
             return Ok(Packet::Incomplete { missing });
         };
         if rights.areas.is_empty() {
             return Err(Refusal::NotGranted);
         }
-        let unmapped = match self.format {
+        let unmapped = match format {
             Format::V1 => Refusal::Unit,
             Format::Crc { .. } => Refusal::Memory,
         };
@@ -354,10 +361,10 @@ impl RawIngest {
         if !memory.span(area).holds(header.address, header.count.get().into()) {
             return Err(Refusal::Range);
         }
-        match self.format.packet_len(&header).checked_sub(bytes.len()) {
+        match format.packet_len(&header).checked_sub(bytes.len()) {
             Some(missing) if missing > 0 => Ok(Packet::Incomplete { missing }),
             _ => {
-                let payload = self.format.payload(&header, bytes)?;
+                let payload = format.payload(&header, bytes)?;
                 Ok(Packet::Whole { header, memory, payload })
             }
         }
@@ -417,7 +424,7 @@ impl RawIngest {
     /// Looks up the rights of a connection again after a reload.
     fn renew<S>(&self, sending: &mut Sending<S>, renewal: &Renewal) -> Result<(), Kind> {
         if sending.ticket.take_outdated() {
-            let renewed = renewal().filter(|rights| rights.format == self.format);
+            let renewed = renewal().filter(|rights| rights.dialect == self.dialect);
             sending.rights = renewed.ok_or(Kind::RightsRevoked)?;
         }
         Ok(())
@@ -463,8 +470,8 @@ impl RawIngest {
         renewal: Renewal,
         stop: watch::Receiver<bool>,
     ) {
-        if let Some(idle) = self.many {
-            return self.serve_many(context, sending, renewal, idle, stop).await;
+        if self.dialect.after_refusal.is_some() {
+            return self.serve_many(context, sending, renewal, stop).await;
         }
         let judged = match self.receive(&mut sending, &renewal, stop.clone()).await {
             Err(end) => {
@@ -476,7 +483,7 @@ impl RawIngest {
         let mut behind = 0;
         let written = match judged.and_then(|()| self.judge(&sending.rights, &sending.bytes)) {
             Ok(Packet::Whole { header, memory, payload }) => {
-                behind = sending.bytes.len() - self.format.packet_len(&header);
+                behind = sending.bytes.len() - self.dialect.format.packet_len(&header);
                 self.write(&context, &sending.peer, (header, memory, payload)).await
             }
             Ok(Packet::Incomplete { .. }) => Err(Refusal::Short),
@@ -522,7 +529,6 @@ impl RawIngest {
         context: Arc<ListenerContext>,
         mut sending: Sending<S>,
         renewal: Renewal,
-        idle: Duration,
         mut stop: watch::Receiver<bool>,
     ) {
         let (mut end, mut begun, mut accepted) = (Kind::Closed, Instant::now(), false);
@@ -560,7 +566,7 @@ impl RawIngest {
                     answered = 0;
                     let was_empty = !sending.is_amid_packet();
                     sending.ticket.set_amid_packet(!was_empty);
-                    let time_limit = if was_empty { idle } else { self.request_timeout };
+                    let time_limit = if was_empty { self.idle } else { self.request_timeout };
                     let read = tokio::select! {
                         read = timeout_at(begun + time_limit, sending.read(usize::MAX)) => read,
                         _ = stop.wait_for(|stop| *stop) => break,
@@ -652,9 +658,9 @@ impl RawIngest {
         let Some(header) = self.header(bytes)? else {
             return Ok(None);
         };
-        let len = self.format.packet_len(&header);
+        let len = self.dialect.format.packet_len(&header);
         let packet = bytes.get(..len).unwrap_or(bytes);
-        let continues = self.after_refusal == AfterRefusal::Continue;
+        let continues = self.dialect.after_refusal == Some(AfterRefusal::Continue);
         if continues && packet.len() < len {
             return Ok(None);
         }
@@ -726,7 +732,7 @@ impl RawIngest {
         (header, payload): (Option<Header>, &[u8]),
         refused: Option<Refusal>,
     ) -> Record {
-        let (format, payload) = (self.format, payload.to_vec());
+        let (format, payload) = (self.dialect.format, payload.to_vec());
         let write = Written::Packet { format, header, payload, refused };
         let (listener, peer) = (Arc::clone(&context.name), Some(peer.clone()));
         Record { listener, peer, write, log_sequence: None, refusals: 0 }
@@ -747,7 +753,7 @@ impl Service for RawIngest {
         context: &ListenerContext,
         mut connection: Admitted<RawGrant>,
     ) -> Admitted<RawGrant> {
-        if self.many.is_some() || self.tls.is_some() {
+        if self.dialect.after_refusal.is_some() || self.tls.is_some() {
             return connection;
         }
         let mut chunk = [0; CHUNK_BYTES];
@@ -761,7 +767,7 @@ impl Service for RawIngest {
                 .write_at_once(context, &connection.peer.into(), (header, memory, payload))
                 .is_ok()
         {
-            bytes = &bytes[self.format.packet_len(&header)..];
+            bytes = &bytes[self.dialect.format.packet_len(&header)..];
             answer(&mut connection.stream, &mut Vec::new(), &connection.ticket, DONE);
         } else {
             connection.ticket.set_amid_packet(len > 0);
@@ -771,7 +777,7 @@ impl Service for RawIngest {
     }
 
     fn ends(&self, before: &RawIngest, peer: &Peer) -> Option<Kind> {
-        let is_other = self.format != before.format || self.tls.is_some() != before.tls.is_some();
+        let is_other = self.dialect != before.dialect || self.tls.is_some() != before.tls.is_some();
         if is_other || self.rights(peer.ip()).is_none() {
             return Some(Kind::RightsRevoked);
         }
@@ -846,6 +852,10 @@ mod tests {
     use crate::server::transports::cut_tests::assert_same_outcome;
 
     fn listener(format: Format, flags: Flags) -> RawIngest {
+        listener_with(((format, flags), PacketsPerConnection::One))
+    }
+
+    fn listener_with(((format, flags), packets): Terms) -> RawIngest {
         let settings = RawSettings {
             bind: SocketAddr::from(([127, 0, 0, 1], 0)),
             format,
@@ -853,7 +863,7 @@ mod tests {
             rules: Vec::new(),
             limits: ConnectionLimits::NONE,
             request_timeout: Duration::from_secs(10),
-            packets: PacketsPerConnection::One,
+            packets,
             tls: None,
         };
         RawIngest::new(&settings, Arc::default())
@@ -877,7 +887,8 @@ mod tests {
         let layout = Layout::default().with(Area::HoldingRegisters, Span::new(0, 8).unwrap());
         let memory = Arc::new(Memory::new(layout, None).unwrap());
         let targets = HashMap::from([(1, memory)]);
-        RawGrant { format: Format::V1, targets, areas: vec![Area::HoldingRegisters] }
+        let dialect = listener(Format::V1, Flags::Strict).dialect;
+        RawGrant { dialect, targets, areas: vec![Area::HoldingRegisters] }
     }
 
     /// Both ends of a connection.
@@ -914,13 +925,12 @@ mod tests {
         let packet = b"RI\x01\x03\x00\x01\x00\x00\x00\x01\x00\x07";
         let context = Arc::new(ListenerContext::for_tests());
         client.shutdown(std::net::Shutdown::Write).unwrap();
-        let raw = listener(Format::V1, Flags::Strict);
+        let raw = listener_with(((Format::V1, Flags::Strict), MANY));
         let sending = raw.sending(admitted(accepted, peer, packet.repeat(PACKETS)));
         let (_engine, stop) = watch::channel(false);
         let mut turns = 0;
         runtime.block_on(async {
-            let serving =
-                raw.serve_many(context, sending, Box::new(|| None), Duration::from_secs(10), stop);
+            let serving = raw.serve_many(context, sending, Box::new(|| None), stop);
             tokio::select! {
                 biased;
                 () = serving => {}
@@ -938,7 +948,7 @@ mod tests {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let packet = b"RI\x01\x03\x00\x01\x00\x00\x00\x01\x00\x07";
         let context = Arc::new(ListenerContext::for_tests());
-        let raw = Arc::new(listener(Format::V1, Flags::Strict));
+        let raw = Arc::new(listener_with(((Format::V1, Flags::Strict), MANY)));
         let (_engine, stop) = watch::channel(false);
         runtime.block_on(async {
             let mut clients = Vec::new();
@@ -949,8 +959,7 @@ mod tests {
                 let sending = raw.sending(admitted(accepted, peer, packet.repeat(packets)));
                 let (raw, context, stop) = (Arc::clone(&raw), Arc::clone(&context), stop.clone());
                 tokio::spawn(async move {
-                    let idle = Duration::from_secs(10);
-                    raw.serve_many(context, sending, Box::new(|| None), idle, stop).await;
+                    raw.serve_many(context, sending, Box::new(|| None), stop).await;
                     raw.packets.accepted.get()
                 })
             };
@@ -1014,7 +1023,13 @@ mod tests {
     }
 
     /// A format, whether flags are ignored, how many packets a connection carries, and what follows a refusal.
-    type Terms = ((Format, Flags), (Option<Duration>, AfterRefusal));
+    type Terms = ((Format, Flags), PacketsPerConnection);
+
+    const MANY: PacketsPerConnection = many(AfterRefusal::Close);
+
+    const fn many(after_refusal: AfterRefusal) -> PacketsPerConnection {
+        PacketsPerConnection::Many { idle: Duration::from_secs(10), after_refusal }
+    }
 
     fn terms() -> impl Iterator<Item = Terms> {
         let (crc, none) = (Format::Crc { required: true }, Format::Crc { required: false });
@@ -1024,17 +1039,8 @@ mod tests {
             (none, Flags::Strict),
             (none, Flags::Ignore),
         ];
-        let many = Some(Duration::from_secs(10));
-        let packets = [
-            (None, AfterRefusal::Close),
-            (many, AfterRefusal::Close),
-            (many, AfterRefusal::Continue),
-        ];
+        let packets = [PacketsPerConnection::One, MANY, many(AfterRefusal::Continue)];
         formats.into_iter().flat_map(move |format| packets.map(|packets| (format, packets)))
-    }
-
-    fn listener_with(((format, flags), (many, after_refusal)): Terms) -> RawIngest {
-        RawIngest { many, after_refusal, ..listener(format, flags) }
     }
 
     /// Packets that are written, refused for each reason, or cut short.
