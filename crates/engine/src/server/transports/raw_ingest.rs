@@ -341,15 +341,30 @@ impl RawIngest {
 
     /// Checks the bytes received so far, up to the end of the first packet.
     fn judge<'p>(&self, rights: &'p RawGrant, bytes: &'p [u8]) -> Result<Packet<'p>, Refusal> {
-        let format = self.dialect.format;
+        let Dialect { format, after_refusal, .. } = self.dialect;
         let Some(header) = self.header(bytes)? else {
             let missing = format.header_len().saturating_sub(bytes.len()).max(1);
             return Ok(Packet::Incomplete { missing });
         };
+        let target = self.target(rights, &header);
+        if after_refusal != Some(AfterRefusal::Continue) {
+            target?;
+        }
+        let missing = format.packet_len(&header).saturating_sub(bytes.len());
+        if missing > 0 {
+            return Ok(Packet::Incomplete { missing });
+        }
+        // Where the next packet follows, this comes first: a wrong CRC leaves unknown where that begins.
+        let payload = format.payload(&header, bytes)?;
+        Ok(Packet::Whole { header, memory: target?, payload })
+    }
+
+    /// The memory that a packet with this header writes.
+    fn target<'p>(&self, rights: &'p RawGrant, header: &Header) -> Result<&'p Memory, Refusal> {
         if rights.areas.is_empty() {
             return Err(Refusal::NotGranted);
         }
-        let unmapped = match format {
+        let unmapped = match self.dialect.format {
             Format::V1 => Refusal::Unit,
             Format::Crc { .. } => Refusal::Memory,
         };
@@ -361,13 +376,7 @@ impl RawIngest {
         if !memory.span(area).holds(header.address, header.count.get().into()) {
             return Err(Refusal::Range);
         }
-        match format.packet_len(&header).checked_sub(bytes.len()) {
-            Some(missing) if missing > 0 => Ok(Packet::Incomplete { missing }),
-            _ => {
-                let payload = format.payload(&header, bytes)?;
-                Ok(Packet::Whole { header, memory, payload })
-            }
-        }
+        Ok(memory)
     }
 
     /// Writes a complete packet, atomically. Waits for the journal of the memory, if it has one.
@@ -660,10 +669,6 @@ impl RawIngest {
         };
         let len = self.dialect.format.packet_len(&header);
         let packet = bytes.get(..len).unwrap_or(bytes);
-        let continues = self.dialect.after_refusal == Some(AfterRefusal::Continue);
-        if continues && packet.len() < len {
-            return Ok(None);
-        }
         let written = match self.judge(rights, packet) {
             Ok(Packet::Incomplete { .. }) => return Ok(None),
             Ok(Packet::Whole { header, memory, payload }) => {
@@ -683,7 +688,7 @@ impl RawIngest {
                 | Refusal::NotStored
                 | Refusal::Busy
                 | Refusal::TooLarge),
-            ) if continues => {
+            ) if self.dialect.after_refusal == Some(AfterRefusal::Continue) => {
                 self.refuse(context, peer, packet, refusal);
                 Ok(Some((len, REFUSED)))
             }
@@ -1145,6 +1150,29 @@ mod tests {
                 let found = runtime.block_on(arrived(listener_with(terms), &sent));
                 assert_eq!(found, expected, "{sent:02x?}");
             }
+        }
+    }
+
+    /// What a damaged packet says of its length may be wrong: what follows it would be judged, and
+    /// answered, as other packets than it was sent as.
+    #[test]
+    fn a_wrong_crc_ends_a_connection_whatever_else_is_wrong() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let socket = runtime.block_on(unused_socket());
+        let format = Format::Crc { required: true };
+        let (count, area) = (NonZeroU16::MIN, PacketArea::HoldingRegisters);
+        let mut good = [0; 18];
+        let header = Header { area, target: 1, address: 0, count };
+        format.encode_to_slice(&header, &[0, 7], &mut good).unwrap();
+        let sent = good.repeat(4);
+        let wrong_area = PacketArea::InputRegisters.code();
+        // The area is not granted, there is no such memory, and two packets more than it are out of range.
+        for (at, byte) in [(4, wrong_area), (7, 2), (11, 1 + 18)] {
+            let mut sent = sent.clone();
+            sent[at] = byte;
+            let terms = ((format, Flags::Strict), many(AfterRefusal::Continue));
+            let found = outcome(terms, (&runtime, &socket), &[&sent], false);
+            assert!(found.starts_with("[1] [0, 0, 0, 0] [(Crc, 1)]"), "{at}: {found}");
         }
     }
 
