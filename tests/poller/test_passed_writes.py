@@ -422,6 +422,35 @@ def test_modbus_passes_no_write_of_the_gate_bit_on(run: Run) -> None:
         assert appliance.memories["mirror"].sealed
 
 
+def test_a_write_that_waits_when_its_memory_is_sealed_is_not_sent(run: Run) -> None:
+    device_writes = HeldWrites()
+    with plc(device_writes) as source, plc() as other:
+        meter = device(source.url, *READS, **RARELY, timeout=wire.DEADLINE)
+        rule = {**RULE, "units": {1: "mirror", 9: {"route": "other"}}}
+        listeners = {"scada": {**MORE["listeners"]["scada"], "rules": [rule]}}
+        devices = {"meter": meter, "other": {"url": other.url}}
+        text = configuration(devices, **{**MORE, "listeners": listeners})
+        appliance = run(with_seal(text, 0))
+        until_read(appliance)
+        mirror = appliance.memories["mirror"]
+        mirror.write("coils", 0, [1])
+        scada = endpoint(appliance, "scada")
+        with wire.Connection(scada) as first, wire.Connection(scada) as second:
+            first.send(wire.frame(b"\x06\x00\x0b\x00\x01"))
+            held = device_writes.next()
+            second.send(wire.frame(b"\x06\x00\x0b\x00\x02", 1, 1))
+            second.send(wire.frame(b"\x03\x00\x00\x00\x01", 9, 2))
+            wire.until(lambda: other.requests, "what follows the second write is on its way")
+            mirror.write("coils", 0, [0])
+            held.answer()
+            assert first.receive().pdu == b"\x06\x00\x0b\x00\x01"
+            assert second.receive().pdu == b"\x86\x06"
+        with posted(appliance, 3) as sent:
+            device_writes.next().answer()
+            assert answer(sent).status == 200
+        assert [pdu[-1] for pdu in writes_of(source)] == [1, 3]
+
+
 def test_a_read_that_takes_several_requests_keeps_what_was_written_meanwhile(run: Run) -> None:
     with plc() as source:
         wide = read("holding_registers", 0, 400, ("holding_registers", 0))

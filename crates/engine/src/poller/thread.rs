@@ -15,7 +15,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use holdfast_memory::Memory;
-use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
+use holdfast_protocol::pdu::EncodedRequest;
 use holdfast_runtime::{lock, time_since_boot};
 use tokio::runtime::Builder;
 use tokio::sync::mpsc;
@@ -350,7 +350,7 @@ async fn run_commands(
             Some(write) = passed.recv() => {
                 match running.get(write.device()) {
                     Some(device) => device.pass(write),
-                    None => write.refuse(ExceptionCode::GatewayPathUnavailable),
+                    None => write.refuse(),
                 }
                 continue;
             }

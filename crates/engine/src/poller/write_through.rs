@@ -18,8 +18,9 @@ use super::destination::ReadSettings;
 use crate::client::ClientError;
 use crate::items::{Items, touched};
 use crate::link::{
-    Caller, Down, Fault, Fence, Link, PendingReply, Permit, Priority, Receiver, confirmation,
-    exception, exception_code, exception_in, fault, pending_reply, standstill, submit_under,
+    Caller, Down, Fault, Fence, Link, PendingReply, Permit, Priority, Receiver, Wanted,
+    confirmation, exception, exception_code, exception_in, fault, pending_reply, standstill,
+    submit_under,
 };
 
 /// The most writes into one memory that wait for devices.
@@ -51,7 +52,10 @@ pub struct Passage {
 /// A write on its way to a device.
 pub(super) struct PassedWrite {
     memory: Arc<Memory>,
+    access: Access,
     range: PassedRange,
+    /// What it writes in the memory.
+    written: Items,
     /// As the client sent it.
     pdu: Vec<u8>,
     /// As the device gets it.
@@ -164,7 +168,9 @@ impl Passage {
         }
         let passed = PassedWrite {
             memory: Arc::clone(&self.memory),
+            access,
             range: range.clone(),
+            written,
             request: translated(pdu, range, read.is_some())?,
             pdu: pdu.to_vec(),
             queued: time_since_boot(),
@@ -211,10 +217,17 @@ impl PassedWrite {
         &self.range.device
     }
 
-    /// Refuses it without a try.
-    pub(super) fn refuse(self, code: ExceptionCode) {
-        let pdu = exception(&self.pdu, code.code());
-        self.reply.send(pdu);
+    /// Refuses it: it was not sent. If its memory is sealed by now, that is the reason.
+    pub(super) fn refuse(self) {
+        let refusal = admit(&self.memory, self.access, self.written).err();
+        let code = refusal.unwrap_or(ExceptionCode::GatewayPathUnavailable);
+        self.reply.send(exception(&self.pdu, code.code()));
+    }
+
+    /// Whether its memory still admits it, for a [`Permit`]: the seal may close while it waits.
+    fn admitted(&self) -> Wanted {
+        let (memory, access, written) = (Arc::clone(&self.memory), self.access, self.written);
+        Arc::new(move |_| admit(&memory, access, written).is_ok())
     }
 
     /// Carries it out. Returns what memory has of it: what has changed in the device, and what
@@ -233,10 +246,14 @@ impl PassedWrite {
         let is_silent = link.admit(unit_id, function) == Err(Down::Unit);
         let is_down = is_silent || link.retry_at().is_some();
         if is_down || !self.is_mirrored(reads) {
-            self.refuse(ExceptionCode::GatewayPathUnavailable);
+            self.refuse();
             return Vec::new();
         }
-        let of_client = permit.and(standstill::none_since(self.queued)).and(self.reply.wanted());
+        // The last notes that it is sent.
+        let of_client = permit
+            .and(standstill::none_since(self.queued))
+            .and(self.admitted())
+            .and(self.reply.wanted());
         let call = async |request: &EncodedRequest, permit| {
             link.call(unit_id, request, timeout, Priority::Urgent, permit).await
         };
@@ -276,10 +293,11 @@ impl PassedWrite {
             None => call(&self.request, &of_client).await,
         };
         let outcome = answered.as_ref().map(drop).map_err(|error| fault(error));
-        // Its device or its client has gone, or may have gone in a standstill, and it was not sent.
+        // Its device or its client has gone, or may have gone in a standstill, or its memory was sealed, and
+        // it was not sent.
         if outcome == Err(Fault::Expired) {
             if !self.reply.is_unwanted() {
-                self.refuse(ExceptionCode::GatewayPathUnavailable);
+                self.refuse();
             }
             return Vec::new();
         }

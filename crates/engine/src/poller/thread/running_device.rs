@@ -7,7 +7,7 @@ use std::rc::Rc;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode};
+use holdfast_protocol::pdu::EncodedRequest;
 use tokio::sync::watch;
 use tokio::task::{AbortHandle, spawn_local};
 
@@ -187,7 +187,7 @@ impl RunningDevice {
         spawn_local(async move {
             let fence = permit.fence.as_ref();
             let Some(taken) = turn.take_to_write(fence, timeout).await else {
-                return write.refuse(ExceptionCode::GatewayPathUnavailable);
+                return write.refuse();
             };
             let changes = write.carry_out((&link, unit_id, &reads), timeout, &permit).await;
             if !changes.is_empty() {
