@@ -728,6 +728,30 @@ def test_requests_do_not_wait_for_ever_until_the_scanner_is_ready(
     assert json.loads(answer) == {"success": False, "error": expected}
 
 
+def test_requests_that_wait_until_the_scanner_is_ready_stay_in_order() -> None:
+    async def work() -> list[str]:
+        handled: list[str] = []
+        ready, done = asyncio.Event(), asyncio.Event()
+
+        async def handle(message: Msg) -> Answer:
+            handled.append(message.subject)
+            if len(handled) == 4:
+                done.set()
+            return Answer(success=True)
+
+        waiting = responder.Responder(10, cast("Outbox", None), ready.wait)
+        begin = waiting.answering("command", handle)
+        for name in ("first", "second", "third"):
+            await begin(Msg(cast("Client", None), name))
+            await asyncio.sleep(0)
+        await begin(Msg(cast("Client", None), "new"))
+        ready.set()  # The new request begins before those that wait go on.
+        await done.wait()
+        return handled
+
+    assert asyncio.run(work()) == ["first", "second", "third", "new"]
+
+
 def test_a_tag_whose_null_is_nan_is_the_same_in_every_request() -> None:
     registry = Registry(ScannerLimits())
     tag = TagRequest("t", 0, "holding", "float32", null=["nan"])

@@ -46,6 +46,8 @@ class Responder:
         self._max_pending = max_pending
         self._outbox = outbox
         self._until_ready = until_ready
+        self._turn = asyncio.Lock()
+        """Held by the request that waits for them. The others get their turns in order."""
         self._tasks: set[asyncio.Task[None]] = set()
         self._request_lock = asyncio.Lock()
         """Held while a request is parsed and checked."""
@@ -105,9 +107,10 @@ class Responder:
             raise Refused(f"{outcome}too many requests: {limit}")
         self._waiting_bytes += size
         try:
-            async with asyncio.timeout(READY_WITHIN_S):
+            async with asyncio.timeout(READY_WITHIN_S), self._turn:
                 for wait in self._until_ready:
                     await wait()
+                self._until_ready = ()  # Some wait for a limited time: only the first one does.
         except TimeoutError:
             raise Refused(f"{outcome}subscriptions are not read yet: try again") from None
         finally:
