@@ -241,16 +241,49 @@ def test_entries_are_read_again_after_a_reconnect(
     wire.until(lambda: tags(own_caller, "c") == {"other"}, "one has changed")
 
 
-def test_a_bucket_that_is_deleted_may_appear_later(
-    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, server: holdfast.Server
+def lost(caplog: pytest.LogCaptureFixture) -> set[tuple[str, int]]:
+    """The lost buckets, and how many keys of them were known."""
+    return {(each["bucket"], each["keys"]) for each in logged(caplog, "bucket_lost")}
+
+
+def test_a_lost_bucket_neither_ends_subscriptions_nor_enables_the_scanner(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    run_scanner(own_nats, **NEXT)
-    own_caller.put(BUCKET, key(), gateway_entry(server, gateway_tag("a", 0)))
-    wire.until(lambda: tags(own_caller) == {"a"}, "it is subscribed")
+    running = run_scanner(own_nats, **NEXT)
+    for device in ("a", "b"):
+        entry = gateway_entry(server, gateway_tag(device, 0), device=device)
+        own_caller.put(BUCKET, key(device), entry)
+    own_caller.put(ENABLED, "modbus", enabled(False))
+    wire.until(lambda: devices(own_caller).keys() == {"a", "b"}, "both are subscribed")
+    wire.until(lambda: logged(caplog, "scanner_disabled") != [], "it is disabled")
+
+    for loses in (own_nats.lose_store, lambda: None):  # Nor when it is read once more.
+        own_nats.kill()
+        wire.until(lambda: not running.serves, "the connection is lost")
+        loses()
+        own_nats.start()
+        wire.until(lambda: running.serves, "it is connected again")
+        own_caller.put(BUCKET, key("c"), gateway_entry(server, gateway_tag("c", 0), device="c"))
+        wire.until(lambda: "c" in devices(own_caller), "a new entry is carried out")
+        own_caller.delete(BUCKET, key("c"))
+        wire.until(lambda: devices(own_caller).keys() == {"a", "b"}, "it has ended")
+    expected = {(BUCKET, 2), (ENABLED, 1)}
+    wire.until(lambda: lost(caplog) == expected, "both losses are logged")
+    assert own_caller.request("modbus.browse", b"")["service"]["enabled"] is False
+    own_caller.delete(BUCKET, key("a"))
+    changed = gateway_entry(server, gateway_tag("other", 0), device="b")
+    own_caller.put(BUCKET, key("b"), changed)
+    wire.until(lambda: devices(own_caller).keys() == {"b"}, "one is ended")
+    wire.until(lambda: tags(own_caller, "b") == {"other"}, "one is replaced")
+    own_caller.delete(ENABLED, "modbus")
+    wire.until(lambda: variables(own_caller) == {"other": (0, "good")}, "it is enabled")
     own_caller.forget(BUCKET)
-    wire.until(lambda: devices(own_caller) == {}, "it has ended")
-    own_caller.put(BUCKET, key(), gateway_entry(server, gateway_tag("b", 0)))
-    wire.until(lambda: tags(own_caller) == {"b"}, "it is subscribed again")
+    own_caller.put(BUCKET, key("a"), gateway_entry(server, gateway_tag("a", 0), device="a"))
+    wire.until(lambda: devices(own_caller).keys() == {"a", "b"}, "a deleted bucket is followed")
 
 
 def test_a_purged_entry_ends_the_subscription(

@@ -51,15 +51,15 @@ class EnabledKey:
             tasks.create_task(self._report_first())
 
     async def _report_first(self) -> None:
-        """Enables the scanner if the key can't be read."""
+        """Enables the scanner if there is no key, or it can't be read."""
         await self.watch.tried.wait()
         self._report()
 
-    async def _on_change(self, found: Mapping[str, Written | None], is_all: bool) -> None:
+    async def _on_change(self, found: Mapping[str, Written | None]) -> None:
         """Takes the state; a malformed one changes nothing."""
-        if self._key not in found and not is_all:
+        if self._key not in found:
             return
-        written = found.get(self._key)
+        written = found[self._key]
         try:
             enabled = written is None or msgspec.json.decode(written.value, type=_State).enabled
         except MALFORMED_JSON as error:

@@ -115,11 +115,10 @@ class EntrySubscriptions:
             tasks.create_task(self.watch.run())
             tasks.create_task(self._try_again())
 
-    async def _on_change(self, changes: Mapping[str, Written | None], is_all: bool) -> None:
-        """Carries out changed entries; with `is_all`, removes entries that `changes` lacks."""
+    async def _on_change(self, changes: Mapping[str, Written | None]) -> None:
+        """Carries out changed entries, and ends those that are deleted."""
         async with self._lock:
-            deleted = [key for key in self._entries if key not in changes] if is_all else []
-            deleted += [key for key, written in changes.items() if written is None]
+            deleted = [key for key, written in changes.items() if written is None]
             for key in deleted:
                 await self._forget(key)
             changed = []

@@ -1,13 +1,14 @@
 """Follows the keys of a JetStream bucket: reads all of them, then each change.
 
 It starts again with all keys after each connection, after an error of JetStream, and when it has
-missed a change. A missing bucket is created.
+missed a change. A missing bucket is created. A key that a lost bucket had is not a deleted one.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
+from holdfast.events import log_lines
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
 from holdfast.scanner.jetstream.availability import (
@@ -81,13 +83,13 @@ class KeyWatch:
         self,
         bucket: str,
         keys: str,
-        on_change: Callable[[Mapping[str, Written | None], bool], Awaitable[None]],
+        on_change: Callable[[Mapping[str, Written | None]], Awaitable[None]],
         times: WatchTimes,
     ) -> None:
         """`keys` is a key, or `>` for all.
 
-        `on_change` gets what changed keys have, `None` for a deleted one, and whether these are
-        all keys of the bucket.
+        `on_change` gets what keys have, `None` for a deleted one: at first all keys, then each
+        change, and all keys again whenever this starts again.
         """
         self._bucket = bucket
         self._keys = keys
@@ -95,6 +97,12 @@ class KeyWatch:
         self._times = times
         self._client: Client | None = None
         self._has_new_client = asyncio.Event()
+        self._made_at = ""
+        """When the bucket was made; empty until it is known."""
+        self._latest = 0
+        """The number of its latest message that is known."""
+        self._known: set[str] = set()
+        """The keys that it has, as far as they are reported."""
         events = "bucket_watched", "bucket_not_watched"
         self._availability = Availability(*events, bucket=bucket)
         self._backoff = Backoff(FIRST_RETRY_S, times.retry_s, jitter=True)
@@ -145,19 +153,39 @@ class KeyWatch:
         jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
         await self._open(jetstream)
         async with reading(jetstream, self._bucket, self._keys) as reader:
-            await self._on_change(await reader.fetch_all(), True)
+            found = await reader.fetch_all()
+            deleted: dict[str, Written | None] = dict.fromkeys(self._known - found.keys())
+            await self._report(deleted | found, reader.latest)
             self._backoff.succeeded()
             self._availability.succeeded()
             self.tried.set()
             while True:
                 if changes := await reader.changes(self._times):
-                    await self._on_change(changes, False)
+                    await self._report(changes, reader.latest)
+
+    async def _report(self, changes: Mapping[str, Written | None], latest: int) -> None:
+        self._latest = max(self._latest, latest)
+        # After an error, the deleted keys are reported again.
+        self._known |= {key for key, written in changes.items() if written is not None}
+        await self._on_change(changes)
+        self._known -= {key for key, written in changes.items() if written is None}
 
     async def _open(self, jetstream: JetStreamContext) -> None:
+        """Makes the bucket, if it is missing. Notes that it is another one, or was set back."""
+        stream = f"KV_{self._bucket}"
         try:
-            await jetstream.stream_info(f"KV_{self._bucket}")
+            info = await jetstream.stream_info(stream)
         except NotFoundError:
             await jetstream.create_key_value(bucket=self._bucket, history=1)
+            info = await jetstream.stream_info(stream)
+        before, self._made_at = self._made_at, str(info.created)
+        if before in ("", self._made_at) and info.state.last_seq >= self._latest:
+            return
+        self._latest = 0
+        if self._known:
+            keys = len(self._known)
+            log_lines.write(logging.WARNING, "bucket_lost", bucket=self._bucket, keys=keys)
+        self._known.clear()
 
 
 class Reader:
@@ -175,6 +203,8 @@ class Reader:
         self._consumer = consumer
         self._received = 0
         """The number of the last message, counted by the server."""
+        self.latest = 0
+        """The greatest number that a message of the bucket has had."""
 
     async def fetch_all(self) -> dict[str, Written | None]:
         """Returns all keys that there are now."""
@@ -211,6 +241,7 @@ class Reader:
         is_marker = any(header in headers for header in MARKER_HEADERS)
         key = message.subject.removeprefix(f"$KV.{self._bucket}.")
         revision = message.metadata.sequence.stream
+        self.latest = max(self.latest, revision)
         return key, None if is_marker else Written(message.data, revision)
 
     async def _check(self) -> None:
