@@ -310,6 +310,23 @@ def test_a_pending_subscription_with_another_profile_keeps_what_its_own_sets(
     assert (found["writable"], found["description"]) == (True, "first")
 
 
+def test_a_tag_that_was_read_only_in_a_whole_profile_can_become_writable(
+    caller: Caller, server: holdfast.Server, run_scanner: Run
+) -> None:
+    def running(*, writable: bool) -> Running:
+        a = Tag("a", "holding_registers", 0, writable=writable)
+        small = TagList([a, Tag("b", "holding_registers", 1)])
+        return run_scanner(prefix="line2", profiles={"small": small})
+
+    first = running(writable=False)
+    request = subscription(server, profile="small")
+    assert caller.request("line2.subscribe", request)["success"]
+    assert caller.request("line2.unsubscribe", leaving("b"))["success"]
+    first.stop()
+    running(writable=True)
+    assert caller.request("line2.command.plc1.a", "5") == {"success": True}
+
+
 @pytest.mark.parametrize("part_bytes", [1, entries.MAX_PART_BYTES])
 @pytest.mark.parametrize("keeps", [True, False])
 def test_a_tag_that_a_profile_gains_ends_no_subscription(

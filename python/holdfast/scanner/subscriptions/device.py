@@ -66,8 +66,11 @@ class TagOptions:
 
     @staticmethod
     def of_profile(tag: tags.Tag) -> TagOptions:
-        """Returns those of a subscriber to a whole profile."""
-        return TagOptions(tag.writable, tag.description or None)
+        """Returns those of a subscriber to a whole profile.
+
+        It declares nothing read-only: the profile does, until it changes.
+        """
+        return TagOptions(tag.writable or None, tag.description or None)
 
 
 NO_OPTIONS = TagOptions(None, None)

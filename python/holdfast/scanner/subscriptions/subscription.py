@@ -269,8 +269,6 @@ def _profile_requests(name: str, rules: Rules) -> list[TagRequest]:
             address=tag.address,
             function_code=CODE_OF_AREA[tag.area],
             datatype=tag.type,
-            writable=tag.writable,
-            description=tag.description or None,
             profile=name,
         )
         for tag in _profile(name, "profile", rules)
