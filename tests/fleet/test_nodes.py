@@ -308,6 +308,12 @@ def test_a_command_reaches_the_device_whoever_receives_it(
     assert "outside" in refused["error"]
 
 
+def record_requests(caller: Caller) -> None:
+    """Has a stream record what nodes ask each other, and confirm it before they answer."""
+    recorded = StreamConfig(name="recorded", subjects=["modbus.fleet.>"])
+    caller.do(caller.client.jetstream().add_stream(recorded))
+
+
 def test_a_command_that_may_be_carried_out_is_not_denied_whoever_receives_it(
     node: Callable[..., Running], caller: Caller, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -320,6 +326,7 @@ def test_a_command_that_may_be_carried_out_is_not_denied_whoever_receives_it(
         tag = {"id": "t", "address": 0, "functionCode": "holding", "datatype": "uint16"}
         request = {"deviceId": "d0", "url": device.url, "scanRate": 100, "subscriberId": "hmi"}
         assert caller.request("modbus.subscribe", request | {"tags": [tag]})["success"]
+        record_requests(caller)
         for value in range(8):
             error = caller.request("modbus.command.t", str(value))["error"]
             assert error.startswith("not confirmed: exception 04")
@@ -623,6 +630,7 @@ def test_browse_and_variables_tell_of_all_nodes(
 ) -> None:
     one, two = node("a"), node("b")
     share(one, two)
+    record_requests(caller)
     subscribe_all(caller, judges)
     wire.until(lambda: all(len(judge.polls) > 3 for judge in judges.devices), "all are polled")
     for _ in range(6):
@@ -1036,7 +1044,13 @@ def test_the_command_line_shows_and_drains_nodes(
     wire.until(lambda: shown() == [("b", 4)], "all devices are shown")
     result = invoke("fleet", "drain", "plant", "a", "--nats", own_nats.url)
     assert result.exit_code == 1
-    assert "there is no node a" in result.stderr
+    assert "there is no live node a" in result.stderr
+    record_requests(caller)
+    result = invoke("fleet", "drain", "plant", "a", "--nats", own_nats.url)
+    assert result.exit_code == 1
+    assert "there is no live node a" in result.stderr
+    result = invoke("fleet", "drain", "plant", "b", "--nats", own_nats.url)
+    assert (result.exit_code, result.stdout) == (0, "b has left the fleet plant.\n")
     result = invoke("fleet", "status", "none", "--nats", own_nats.url)
     assert result.exit_code == 1
     assert "no fleet none" in result.stderr

@@ -7,7 +7,7 @@ import contextlib
 import time
 from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 from nats.errors import Error, NoRespondersError
@@ -15,9 +15,10 @@ from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import nats_reason
-from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.scanner.errors import STOPPING, Moved, NotConfirmed, Refused
 from holdfast.scanner.fleet.partition_leases import PARTITION
+from holdfast.scanner.fleet.questions import ask, subject
+from holdfast.scanner.messages.types import Answer
 from holdfast.scanner.reports.variables import fitting, joined
 
 if TYPE_CHECKING:
@@ -27,11 +28,10 @@ if TYPE_CHECKING:
 
     from holdfast.replication.leases.bucket import Holding
     from holdfast.scanner.fleet.member import FleetMember
+    from holdfast.scanner.fleet.questions import Reply
     from holdfast.scanner.placement import CommandHost, ReportHost
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
-
-Reply = TypeVar("Reply", bound=msgspec.Struct)
 
 ANSWER_TIMEOUT_S = 2.0
 """Time to wait for the answer of another node."""
@@ -55,10 +55,9 @@ class Command(msgspec.Struct, kw_only=True):
     """Seconds that it may wait for the device, besides one timeout of the device."""
 
 
-class Executed(msgspec.Struct, kw_only=True, omit_defaults=True):
+class Executed(Answer, forbid_unknown_fields=True, kw_only=True):
     """The answer to a command."""
 
-    error: str | None = None
     not_confirmed: bool = False
     """With an error: it may have been carried out."""
     moved: bool = False
@@ -73,17 +72,12 @@ class ReportQuestion(msgspec.Struct, kw_only=True):
     """The number of variables of the first device to skip."""
 
 
-class NodeReports(msgspec.Struct, kw_only=True):
+class NodeReports(Answer, forbid_unknown_fields=True, kw_only=True):
     """The reports, or the variables, of some of the devices: as many as fit into a message."""
 
-    devices: dict[str, Any]
+    devices: dict[str, Any] = msgspec.field(default_factory=dict)
     is_full: bool = False
     """Whether some did not fit: the next devices, or variables of the last one."""
-
-
-def subject(prefix: str, node: str, what: str, process: str = "") -> str:
-    """Where a node is asked; with `process`, only that one: two may have the same name."""
-    return ".".join((prefix, "fleet", node, *([process] if process else []), what))
 
 
 class OtherNodes:
@@ -183,11 +177,12 @@ class OtherNodes:
     ) -> NodeReports:
         question = ReportQuestion(devices=devices, offset=offset)
         try:
-            return await self._ask(node, what, question, NodeReports, ANSWER_TIMEOUT_S)
+            reports = await self._ask(node, what, question, NodeReports, ANSWER_TIMEOUT_S)
         except (Error, OSError) as error:
-            reason = nats_reason(error)
-            log_lines.refused("node_silent", kind="fleet", node=node.node, reason=reason)
-            return NodeReports(devices={})
+            reports = NodeReports(success=False, error=nats_reason(error))
+        if not reports.success:
+            log_lines.refused("node_silent", kind="fleet", node=node.node, reason=reports.error)
+        return reports
 
     async def _ask(
         self, node: Holding, what: str, request: msgspec.Struct, kind: type[Reply], seconds: float
@@ -196,11 +191,7 @@ class OtherNodes:
         if client is None:
             raise NoAnswer
         where = subject(self._prefix, node.node, what, node.process)
-        answer: Msg = await client.request(where, msgspec.json.encode(request), timeout=seconds)
-        try:
-            return msgspec.json.decode(answer.data, type=kind)
-        except MALFORMED_JSON as error:
-            raise OSError(f"node {node.node} sent a malformed answer: {error}") from None
+        return await ask(client, where, msgspec.json.encode(request), kind, seconds)
 
 
 @dataclass(eq=False)
@@ -224,13 +215,14 @@ class NodeAnswers:
         try:
             # The sender may know of a later lease, which this node has not heard of yet.
             if device is None or not self._member.is_current(device, command.epoch):
-                return msgspec.json.encode(Executed(moved=True))
+                return msgspec.json.encode(Executed(success=False, moved=True))
             await self._commands.write(command.device, command.tag, command.text, remaining_s)
-            executed = Executed()
+            executed = Executed(success=True)
         except Moved:
-            executed = Executed(moved=True)
+            executed = Executed(success=False, moved=True)
         except Refused as refused:
-            executed = Executed(error=str(refused), not_confirmed=isinstance(refused, NotConfirmed))
+            is_uncertain = isinstance(refused, NotConfirmed)
+            executed = Executed(success=False, error=str(refused), not_confirmed=is_uncertain)
         return msgspec.json.encode(executed)
 
     async def browse(self, message: Msg) -> bytes:
@@ -265,4 +257,5 @@ class NodeAnswers:
 
 def _answer(devices: bytes, is_all: bool) -> bytes:
     """Returns `NodeReports` as JSON."""
-    return b'{"devices":{%b},"is_full":%b}' % (devices, b"false" if is_all else b"true")
+    is_full = b"false" if is_all else b"true"
+    return b'{"success":true,"devices":{%b},"isFull":%b}' % (devices, is_full)

@@ -8,16 +8,16 @@ from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 from nats.errors import Error, NoRespondersError
+from nats.errors import TimeoutError as NoAnswer
 from nats.js.errors import NotFoundError
 
 from holdfast.net.nats.connection import ANSWERING, connected_once, nats_reason
 from holdfast.replication.leases.bucket import Holding, LeaseBucket
 from holdfast.replication.leases.times import LEASE_TIMES
-from holdfast.runtime.malformed_json import MALFORMED_JSON
-from holdfast.scanner.fleet.nodes import subject
 from holdfast.scanner.fleet.partition_leases import NODE, PARTITION, leases_of
+from holdfast.scanner.fleet.questions import ask, subject
+from holdfast.scanner.messages.types import Answer
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -145,15 +145,16 @@ class FleetObserver:
 
     async def drain(self, node: str, prefix: str) -> None:
         """Has a node leave. Raises `FleetUnavailable` if it does not."""
-        where = subject(prefix, node, "drain")
+        is_known = node in (await self.look()).nodes
         try:
-            answer = await self._client.request(where, b"", timeout=ANSWERING)
-            if not msgspec.json.decode(answer.data, type=dict[str, Any]).get("success"):
-                raise FleetUnavailable(f"node {node} does not leave")
-        except NoRespondersError:
-            raise FleetUnavailable(f"there is no node {node} at {prefix}.fleet") from None
-        except (Error, OSError, *MALFORMED_JSON) as error:
-            raise FleetUnavailable(f"node {node} does not answer: {nats_reason(error)}") from None
+            await ask(self._client, subject(prefix, node, "drain"), b"", Answer, ANSWERING)
+        except (Error, OSError) as error:
+            # A stream that records the subject is a responder, also if there is no such node.
+            if isinstance(error, NoRespondersError if is_known else (NoRespondersError, NoAnswer)):
+                flaw = f"there is no live node {node} at {prefix}.fleet"
+            else:
+                flaw = f"node {node} does not answer: {nats_reason(error)}"
+            raise FleetUnavailable(flaw) from None
         end = time.monotonic() + LEAVE_TIMEOUT_S
         while node in (await self.look()).nodes:
             await asyncio.sleep(CHECK_INTERVAL_S)

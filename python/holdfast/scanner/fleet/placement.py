@@ -14,7 +14,8 @@ from holdfast.net.nats.outbox import Outbox
 from holdfast.scanner.fleet import shutdown
 from holdfast.scanner.fleet.agreement import Terms
 from holdfast.scanner.fleet.member import FleetMember
-from holdfast.scanner.fleet.nodes import NodeAnswers, OtherNodes, subject
+from holdfast.scanner.fleet.nodes import NodeAnswers, OtherNodes
+from holdfast.scanner.fleet.questions import subject
 from holdfast.scanner.fleet.reports import FleetReports
 from holdfast.scanner.messages.types import Answer, FleetReport
 

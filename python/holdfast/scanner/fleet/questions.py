@@ -1,0 +1,53 @@
+"""How a node of a fleet is asked, by another node or from outside."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import TYPE_CHECKING, TypeVar
+
+import msgspec
+from nats.aio.client import NO_RESPONDERS_STATUS
+from nats.errors import Error, NoRespondersError
+from nats.errors import TimeoutError as NoAnswer
+from nats.js.api import Header
+
+from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.scanner.messages.types import Answer
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+
+Reply = TypeVar("Reply", bound=Answer)
+
+
+def subject(prefix: str, node: str, what: str, process: str = "") -> str:
+    """Where a node is asked; with `process`, only that one: two may have the same name."""
+    return ".".join((prefix, "fleet", node, *([process] if process else []), what))
+
+
+async def ask(
+    client: Client, where: str, question: bytes, kind: type[Reply], seconds: float
+) -> Reply:
+    """Returns the answer of a node. Raises errors of nats-py.
+
+    `Client.request` returns the first message that comes. If a stream of JetStream records the
+    subject, that is the confirmation of the stream, also when there is no such node. So whatever
+    is not an answer is skipped.
+    """
+    inbox = client.new_inbox()
+    messages = await client.subscribe(inbox)
+    try:
+        async with asyncio.timeout(seconds):
+            await client.publish(where, question, reply=inbox)
+            while True:
+                message = await messages.next_msg(None)
+                if (message.headers or {}).get(Header.STATUS) == NO_RESPONDERS_STATUS:
+                    raise NoRespondersError
+                with contextlib.suppress(*MALFORMED_JSON):
+                    return msgspec.json.decode(message.data, type=kind)
+    except TimeoutError:
+        raise NoAnswer from None
+    finally:
+        with contextlib.suppress(Error):  # The connection was closed.
+            await messages.unsubscribe()
