@@ -14,9 +14,11 @@ from nats.errors import TimeoutError as NoAnswer
 from holdfast.net.nats import batch
 from holdfast.net.nats.connection import Servers
 from holdfast.net.nats.outbox import Outbox
-from holdfast.scanner.fleet import desired_state
+from holdfast.scanner.errors import Moved
+from holdfast.scanner.fleet import desired_state, nodes
 from holdfast.scanner.fleet.agreement import Terms
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
+from holdfast.scanner.fleet.nodes import Executed, OtherNodes
 from holdfast.scanner.settings import FleetSettings, Settings
 from holdfast.tags import Tag, TagList
 
@@ -165,3 +167,59 @@ def test_an_attempt_to_restore_ends_before_the_next_one(monkeypatch: pytest.Monk
         assert bucket.stored == before
 
     asyncio.run(work())
+
+
+@pytest.mark.parametrize("becomes_own", [True, False])
+def test_commands_that_wait_for_a_node_are_carried_out_in_order(
+    monkeypatch: pytest.MonkeyPatch, *, becomes_own: bool
+) -> None:
+    written: list[str] = []
+    sent_back = {"0"}
+
+    async def is_moved(text: str) -> bool:
+        if text not in sent_back:
+            written.append(text)
+            return False
+        sent_back.clear()
+        for _turn in range(20):
+            await asyncio.sleep(0)
+        return True
+
+    async def ask(_: object, __: str, question: bytes, *___: object) -> Executed:
+        moved = await is_moved(msgspec.json.decode(question)["text"])
+        return Executed(success=not moved, moved=moved)
+
+    async def work() -> None:
+        has_node = False
+        fleet = SimpleNamespace(
+            settings=FleetSettings("plant", "a", 16),
+            leases=SimpleNamespace(seen={}),
+            holder=lambda _: SimpleNamespace(node="b", process="") if has_node else None,
+            is_other=lambda _: True,
+        )
+        member: Any = SimpleNamespace(
+            fleet=fleet,
+            client=object(),
+            known=lambda device: device,
+            is_own=lambda _: has_node and becomes_own,
+        )
+        device: Any = SimpleNamespace(id="d", partition=0, source=SimpleNamespace(timeout=500))
+        others = OtherNodes("modbus", member)
+
+        async def write(text: str) -> None:
+            async def own(last_moment: Callable[[], float]) -> None:
+                if await is_moved(text):
+                    raise Moved
+                last_moment()
+
+            await others.write(device, "t", text, own, lambda: 10.0)
+
+        commands = [asyncio.create_task(write(text)) for text in "0123"]
+        await asyncio.sleep(0)
+        commands.pop(1).cancel()
+        has_node = True
+        await asyncio.gather(*commands, write("4"))
+
+    monkeypatch.setattr(nodes, "ask", ask)
+    asyncio.run(work())
+    assert written == ["0", "2", "3", "4"]

@@ -91,7 +91,7 @@ class Commands:
         async with self._responder.in_order(message):
             device, tag = self._registry.commanded(name)
         remaining_s = partial(self.remaining_s, message)
-        own = partial(self.write, device.id, tag.id, text, remaining_s)
+        own = partial(self.write, device.id, tag.id, text)
         await self._placement.write(device, tag, text, own, remaining_s)
         return Answer(success=True)
 

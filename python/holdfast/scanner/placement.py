@@ -244,16 +244,17 @@ class Placement:
         _device: ScannedDevice,
         _tag: Tag,
         _text: str,
-        own: Callable[[], Awaitable[None]],
-        _remaining_s: Callable[[], float],
+        own: Callable[[Callable[[], float]], Awaitable[None]],
+        remaining_s: Callable[[], float],
         /,
     ) -> None:
         """Has a command carried out by the scanner that polls the device. Raises `Refused`.
 
-        `own` carries it out here. It raises `Moved`, and writes nothing, if the device has moved.
-        `remaining_s` refuses it if it is too late, and returns how many seconds it may wait.
+        `remaining_s` refuses it if it is too late, and returns how many seconds it may wait. `own`
+        carries it out here, and calls that at the last moment. It raises `Moved`, and writes
+        nothing, if the device has moved.
         """
-        await own()
+        await own(remaining_s)
 
     def is_addressed(self, _payload: bytes, /) -> bool:
         """Whether a shutdown message is for this scanner, and not for another node."""

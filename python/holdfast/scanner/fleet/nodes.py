@@ -6,8 +6,9 @@ import asyncio
 import contextlib
 import time
 from dataclasses import dataclass
-from itertools import islice
+from itertools import count, islice
 from typing import TYPE_CHECKING, Any
+from weakref import WeakValueDictionary
 
 import msgspec
 from nats.errors import Error, NoRespondersError
@@ -16,6 +17,7 @@ from nats.errors import TimeoutError as NoAnswer
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import nats_reason
 from holdfast.scanner.errors import STOPPING, Moved, NotConfirmed, Refused
+from holdfast.scanner.fleet.command_order import WaitingCommands
 from holdfast.scanner.fleet.partition_leases import PARTITION
 from holdfast.scanner.fleet.questions import ask, subject
 from holdfast.scanner.messages.types import Answer
@@ -37,7 +39,8 @@ ANSWER_TIMEOUT_S = 2.0
 """Time to wait for the answer of another node."""
 
 RETRY_S = 0.1
-"""Between attempts to find the node that polls a device."""
+"""Between attempts to find the node that polls a device. In this time, a node that does not poll it
+answers; one that does may take longer."""
 
 ENVELOPE_BYTES = 512
 """Bytes of an answer without devices."""
@@ -89,38 +92,65 @@ class OtherNodes:
         self._fleet = member.fleet
         self._move_timeout_s = 2 * self._fleet.settings.lease_times.ttl_s
         """How long a command waits for a node that polls its device: twice a takeover."""
+        self._numbers = count()
+        """Of commands, in the order in which they were received."""
+        self._waiting: WeakValueDictionary[str, WaitingCommands] = WeakValueDictionary()
+        """By device. Each of its commands keeps them."""
 
     async def write(
         self,
         device: ScannedDevice,
         tag: str,
         text: str,
-        own: Callable[[], Awaitable[None]],
+        own: Callable[[Callable[[], float]], Awaitable[None]],
         remaining_s: Callable[[], float],
     ) -> None:
         """Has a command carried out by the node that polls the device. Raises `Refused`.
 
-        `own` carries it out here. It raises `Moved`, and writes nothing, if the device has moved.
-        `remaining_s` refuses it if it is too late, and returns how many seconds it may wait.
+        See `Placement.write`. Of the commands to one device that wait, the one that was received
+        first goes first.
         """
         end = time.monotonic() + self._move_timeout_s
-        why = f"no node polls {device.id} now"
-        while True:
-            # Each time: this loop may run for seconds, and the address of the device may change.
-            left, device = remaining_s(), self._member.known(device)
-            owner = self._fleet.holder(device.partition)
-            if self._member.is_own(device):
-                with contextlib.suppress(Moved):
-                    await own()
-                    return
-            elif owner is not None and self._fleet.is_other(owner):
-                sent = await self._forward(owner, device, tag, text, left)
-                if sent is None:
-                    return
-                why = sent
-            if time.monotonic() > end:
-                raise Refused(f"not written: {why}")
-            await asyncio.sleep(RETRY_S)
+        why, was_tried = f"no node polls {device.id} now", False
+        waiting = self._waiting.setdefault(device.id, WaitingCommands())
+        number = next(self._numbers)
+
+        def last_moment() -> float:
+            seconds = remaining_s()
+            waiting.leave(number)
+            return seconds
+
+        try:
+            while True:
+                waiting.join(number)
+                if was_tried:
+                    await asyncio.sleep(RETRY_S)
+                is_first = await waiting.turn(number, end - time.monotonic())
+                # Each time: it may have waited, and the address of the device may change meanwhile.
+                left, device = remaining_s(), self._member.known(device)
+                if not is_first:
+                    raise Refused(f"not written: earlier commands to {device.id} wait")
+                owner = self._fleet.holder(device.partition)
+                if self._member.is_own(device):
+                    with contextlib.suppress(Moved):
+                        await own(last_moment)
+                        return
+                elif owner is not None and self._fleet.is_other(owner):
+                    # During a move, the next one waits: this one may be sent back.
+                    pause = RETRY_S if was_tried else 0
+                    leaving = asyncio.get_running_loop().call_later(pause, waiting.leave, number)
+                    try:
+                        sent = await self._forward(owner, device, tag, text, left)
+                    finally:
+                        leaving.cancel()
+                    if sent is None:
+                        return
+                    why = sent
+                if time.monotonic() > end:
+                    raise Refused(f"not written: {why}")
+                was_tried = True
+        finally:
+            waiting.leave(number)
 
     async def _forward(
         self, owner: Holding, device: ScannedDevice, tag: str, text: str, left: float

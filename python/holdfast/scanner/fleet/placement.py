@@ -76,7 +76,7 @@ class FleetPlacement(FleetMember):
         device: ScannedDevice,
         tag: Tag,
         text: str,
-        own: Callable[[], Awaitable[None]],
+        own: Callable[[Callable[[], float]], Awaitable[None]],
         remaining_s: Callable[[], float],
         /,
     ) -> None:
