@@ -301,6 +301,27 @@ def test_problems_in_profile_files_name_file_line_and_tag(tmp_path: Path) -> Non
     ]
 
 
+@pytest.mark.parametrize(
+    ("settings", "keys"),
+    [
+        ("area: coil, address: 0, type: U16, order: LE, scale: 0", "area type order scale"),
+        ("area: holding_registers, address: 70000, type: U16, scale: 0", "address type scale"),
+        ("area: input_registers, address: 0, round: up, writable: true", "round writable"),
+        # What only the invalid value makes an error is none.
+        ("area: hr, address: 0, type: 'bool[200]', writable: true, null: [yes]", "area"),
+        ("area: coils, address: 0, type: int16, scale: 0.1, max: 3", "type"),
+        ("area: holding_registers, address: 0, type: f32, states: {-1: a}, null: [nan]", "type"),
+        ("area: hr, address: 900, scale: {from: {area: coils, address: 0}, as: factor}", "area"),
+    ],
+)
+def test_each_wrong_key_of_a_tag_is_reported(tmp_path: Path, settings: str, keys: str) -> None:
+    listed = problems(written(tmp_path, f"tags: {{a: {{{settings}}}}}", "tags.yaml"))
+    assert {each.split(": ")[1] for each in listed} == {f"tags.a.{key}" for key in keys.split()}
+    mapped = f"mqtt: {{map: [{{topic: t, memory: m, tag: {{{settings}}}}}]}}"
+    found = {each.split(": ")[1] for each in problems(written(tmp_path, mapped))}
+    assert found >= {f"mqtt.map[0].tag.{key}" for key in keys.split()}
+
+
 def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
     tags = (
         "a: {area: input_registers, address: 1, null: [-5]}, "

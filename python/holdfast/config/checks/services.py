@@ -226,10 +226,13 @@ def _tag(scope: Scope, path: KeyPath, entry: MappingConfig) -> Tag | None:
     if given(entry, "tag"):
         for key in given(entry, "profile", "name"):
             report.add_key((*path, key), "found together with tag, allowed: only one of them")
+        if entry.tag is None:
+            return None
         try:
-            return None if entry.tag is None else entry.tag.tag("tag", DEFAULT_ORDER)
-        except TagError as error:
-            report.add((*path, "tag", error.key), str(error))
+            return entry.tag.tag("tag", DEFAULT_ORDER)
+        except (TagError, InvalidValue):
+            for error in entry.tag.flaws("tag", DEFAULT_ORDER):
+                report.add((*path, "tag", error.key), str(error))
             return None
     for key in ("profile", "name"):
         if not given(entry, key):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.config.checks.common import Scope, check_name, items, until_invalid
+from holdfast.config.models.base import InvalidValue
 from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import extent
 from holdfast.tags import Tag, TagError
@@ -69,11 +70,12 @@ def _tags(scope: Scope, path: KeyPath, tags: Mapping[str, TagConfig], order: str
         with until_invalid():
             try:
                 found[name] = settings.tag(name, order)
-            except TagError as error:
-                at = (*where, error.key)
-                if error.key == "order" and settings.order is None:
-                    at = (*path, "order") if path[0] == "profiles" else where
-                scope.report.add(at, str(error))
+            except (TagError, InvalidValue):
+                for error in settings.flaws(name, order):
+                    at = (*where, error.key)
+                    if error.key == "order" and settings.order is None:
+                        at = (*path, "order") if path[0] == "profiles" else where
+                    scope.report.add(at, str(error))
     return found
 
 

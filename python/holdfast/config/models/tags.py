@@ -5,7 +5,7 @@ from __future__ import annotations
 import unicodedata
 from functools import cached_property
 from math import isfinite
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, Strict
 from pydantic.config import JsonDict
@@ -16,10 +16,14 @@ from holdfast.config.models.memories import Register
 from holdfast.config.text.messages import show
 from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, Number, check_state_name
 from holdfast.config.values.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
-from holdfast.tags import Tag, TagList
+from holdfast.tags import Tag, TagError, TagList
 from holdfast.tags.rounding import Rounding
-from holdfast.types import Area
+from holdfast.tags.tag import JUDGED_WITH
+from holdfast.types import BIT_AREAS, Area
 from holdfast.values.orders import DEFAULT_ORDER
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
 
 
 def _written(marker: bool | int | float | str) -> bool | int | float | str:
@@ -91,19 +95,62 @@ class TagConfig(Model):
 
     def tag(self, name: str, order: str) -> Tag:
         """The tag, with a default order. Raises `TagError`."""
-        settings: dict[str, Any] = {key: getattr(self, key) for key in _KEYS}
-        settings["type"] = (self.type or "").lower()
-        order = (self.order or order).upper()
-        if INVALID in (*self.null, *self.states.values()):
+        settings = self._valid_settings(order)
+        if len(settings) < len(type(self).model_fields):
             raise InvalidValue
-        if not all(isinstance(number, int) for number in self.states):
-            raise InvalidValue  # Invalid keys stay in a mapping.
-        if isinstance(self.scale, ScaleConfig):
-            settings["scale"] = self.scale.of(order)
-        return Tag(name, null=frozenset(self.null), order=order, **settings)
+        return _made(name, settings)
+
+    def flaws(self, name: str, order: str) -> Iterator[TagError]:
+        """Every reason why the valid keys do not make a tag.
+
+        A key with a flaw counts as not given, and what can't be judged without it is not reported.
+        """
+        settings = self._valid_settings(order)
+        wrong = type(self).model_fields.keys() - settings.keys()
+        while True:
+            try:
+                _made(name, settings)
+                return
+            except TagError as error:
+                value = settings.pop(error.key)
+                is_register = isinstance(value, ScaleConfig)
+                needed = _PLACE if is_register else JUDGED_WITH.get(error.key, _NOTHING)
+                if wrong.isdisjoint(needed):
+                    yield error
+                wrong.add(error.key)
+                if error.key == "type" and settings.get("area") in BIT_AREAS:
+                    del settings["area"]  # Each key of numbers would be an error in bits.
+                    wrong.add("area")
+
+    def _valid_settings(self, order: str) -> dict[str, Any]:
+        settings = dict(self.__dict__)  # Invalid keys are not there.
+        if "type" in settings:
+            settings["type"] = (self.type or "").lower()
+        if "order" in settings:
+            settings["order"] = (self.order or order).upper()
+        if "null" in settings:
+            settings["null"] = frozenset(self.null)
+        # Invalid entries stay in a set or mapping, and so do invalid keys.
+        if INVALID in settings.get("null", ()):
+            del settings["null"]
+        states = settings.get("states", {})
+        if INVALID in states.values() or not all(isinstance(number, int) for number in states):
+            del settings["states"]
+        return settings
 
 
-_KEYS = tuple(key for key in TagConfig.model_fields if key not in ("null", "order"))
+def _made(name: str, settings: Mapping[str, Any]) -> Tag:
+    """The tag with these settings. Raises `TagError`."""
+    scale = settings.get("scale")
+    if isinstance(scale, ScaleConfig):
+        settings = {**settings, "scale": scale.of(settings.get("order", DEFAULT_ORDER))}
+    return Tag(name, **{**_ANYWHERE, **settings})
+
+
+_ANYWHERE: dict[str, Any] = {"area": "holding_registers", "address": 0}
+"""In place of an invalid area or address, so that other keys are judged all the same."""
+_PLACE = frozenset(_ANYWHERE)
+_NOTHING = frozenset[str]()
 
 
 class ProfileConfig(Model):

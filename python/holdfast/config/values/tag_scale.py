@@ -60,6 +60,9 @@ class ScaleConfig:
         try:
             return RegisterScale(self.form, source=Tag("", area, address, kind.lower(), order))
         except TagError as error:
+            # The order is that of the tag.
+            if error.key == "order":
+                raise
             raise TagError("scale", f"from: {error}") from None
 
 
