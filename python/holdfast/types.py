@@ -27,6 +27,8 @@ BIT_AREAS: tuple[BitArea, ...] = get_args(BitArea)
 REGISTER_AREAS: tuple[RegisterArea, ...] = get_args(RegisterArea)
 SHORT_AREAS: dict[str, Area] = dict(zip(("co", "di", "hr", "ir"), AREAS, strict=True))
 """The areas by their short names."""
+KNOWN_AREAS = SHORT_AREAS | dict(zip(("coil", "discrete", "holding", "input"), AREAS, strict=True))
+"""The areas by all names but their own that people and lists of manufacturers use."""
 SHORT_OF: dict[Area, str] = {area: short for short, area in SHORT_AREAS.items()}
 
 

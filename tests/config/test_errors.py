@@ -519,6 +519,10 @@ def test_initial_values_from_yaml_are_checked(folder: Folder, values: str, probl
         ("a:\n\tb: 1", "2: not YAML: a tab indents this line, allowed: spaces"),
         ("a:\n  b: 1\n  \tc: 2", "3: not YAML: a tab indents this line, allowed: spaces"),
         ("a: 1\nb:\tc", "2: a tab before a value, allowed: spaces"),
+        ("a: {unit: %}", "1: not YAML: text that begins with % needs quotes around the whole, "
+         "as in unit: '%'"),
+        ("a:\n  b: 1\n\xa0 c: 2\n  d: 3", "3: not YAML: found the character U+00A0 "
+         "(no-break space), allowed: spaces"),
         ("a:\n    b: 1\n  c: 2", "3: not YAML: indented unlike the keys above it, allowed: keys of "
          "one mapping begin in the same column"),
         (

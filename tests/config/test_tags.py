@@ -361,6 +361,32 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
         ),
         (
             "t.yaml",
+            "tags: {a: {area: IR, address: 1}}\n",
+            "t.yaml:1: tags.a.area: found 'IR', allowed: coils, discrete_inputs, "
+            "holding_registers or input_registers; did you mean 'input_registers'?",
+        ),
+        (
+            "t.yaml",
+            "tags: {a: {area: holding_registers, address: 1, min: 0,05}}\n",
+            "t.yaml:1: tags.a.5: found a decimal comma before it, allowed: a decimal point",
+        ),
+        (
+            "t.yaml",
+            "tags:\n  a:\n    area: coils\n    address: 1\n    scale: 0,1\n",
+            "t.yaml:5: tags.a.scale: '0,1' has a decimal comma, allowed: a decimal point",
+        ),
+        (
+            "p.yaml",
+            DEVICE.replace("interval: 1", "interval: '1,5'"),
+            "p.yaml:1: devices.a.interval: '1,5' has a decimal comma, allowed: a decimal point",
+        ),
+        (
+            "t.yaml",
+            "tags: {a: {area: coils, address: 1,\xa0min: 2}}\n",
+            "t.yaml:1: tags.a.'\\xa0min': found the character U+00A0 (no-break space) before",
+        ),
+        (
+            "t.yaml",
             "order: A\ntags: {a: {area: input_registers, address: 1}}\n",
             "t.yaml:1: order",
         ),

@@ -16,10 +16,12 @@ from holdfast.config.models.listeners import LISTENER_TYPES, UNIT_TAGS
 from holdfast.config.models.outputs import OUTPUT_TYPES
 from holdfast.config.models.partial import partial
 from holdfast.config.models.root import Config
-from holdfast.config.text.messages import shape, show
+from holdfast.config.text.messages import foreign_space, shape, show
 from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import either, listing
 from holdfast.runtime.time_units import seconds_in
+from holdfast.tags.text import decimal_comma
+from holdfast.types import KNOWN_AREAS
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,7 +75,7 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
     elif kind == "missing":
         report.add_key(path, f"missing, allowed: {allowed(path, data)}")
     elif kind in ("extra_forbidden", "invalid_key"):
-        report.add_key(path, _unknown(path, data))
+        report.add_key(path, _unknown(path, report))
     elif kind == "problem_at":
         context = error["ctx"]
         where = (*path, context["key"]) if context["key"] else path
@@ -83,10 +85,20 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
     else:
         while not report.document.holds(path):
             path = path[:-1]
-        near = suggestion(error["input"], _words(error)) if kind == "literal_error" else ""
+        near = _near(error) if kind == "literal_error" else ""
         words = "an integer" if of_key and kind == "int_type" else f"{allowed(path, data)}{near}"
         words += _in_seconds(error["input"], words)
-        report.add(path, f"found {_shown(path, error['input'])}, allowed: {words}")
+        found = _shown(path, error["input"])
+        comma = decimal_comma(str(error["input"])) if words.startswith("a number") else None
+        message = f"found {found}, allowed: {words}" if comma is None else f"{found} {comma}"
+        report.add(path, message)
+
+
+def _near(error: ErrorDetails) -> str:
+    """The word that was probably meant."""
+    words, found = _words(error), error["input"]
+    area = KNOWN_AREAS.get(str(found).lower())
+    return suggestion(area if area in words else found, words)
 
 
 def _words(error: ErrorDetails) -> list[str]:
@@ -123,6 +135,24 @@ def _shown(path: KeyPath, value: object) -> str:
     return shape(value) if of_token or path[-1:] in _URLS else show(value)
 
 
-def _unknown(path: KeyPath, data: object) -> str:
-    known = known_keys(path[:-1], data)
-    return f"unknown key, allowed: {listing(known)}{suggestion(path[-1], known)}"
+def _unknown(path: KeyPath, report: Report) -> str:
+    key = path[-1]
+    if (blank := foreign_space(str(key))) is not None:
+        return f"found {blank} before the key, allowed: spaces"
+    if isinstance(key, int) and _follows_number(path, report):
+        return "found a decimal comma before it, allowed: a decimal point, as in 0.1"
+    known = known_keys(path[:-1], report.document.data)
+    return f"unknown key, allowed: {listing(known)}{suggestion(key, known)}"
+
+
+def _follows_number(path: KeyPath, report: Report) -> bool:
+    """Whether a key is what follows a decimal comma in brackets: `{scale: 0,1}`."""
+    owner = report.raw(path[:-1]) if report.document.holds(path) else {}
+    keys = list(owner)
+    before = keys[keys.index(path[-1]) - 1] if path[-1] in keys[1:] else None
+    return (
+        before is not None
+        and owner[path[-1]] is None
+        and type(owner[before]) is int
+        and report.line(path) == report.line((*path[:-1], before))
+    )

@@ -21,7 +21,7 @@ from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import listing
 from holdfast.tags import TagList
 from holdfast.tags.text import decimal_comma
-from holdfast.types import AREAS, SHORT_AREAS
+from holdfast.types import KNOWN_AREAS
 
 if TYPE_CHECKING:
     from holdfast.config.models.tags import ProfileConfig
@@ -40,9 +40,6 @@ COLUMNS = (
 """The columns of CSV, in this order if the file does not name them."""
 MORE_COLUMNS = ("min", "max", "deadband", "round", "encoding", "null")
 """Columns that a file can have if it names its columns."""
-
-_SHORT = SHORT_AREAS | dict(zip(("coil", "discrete", "holding", "input"), AREAS, strict=True))
-"""Names of areas that lists of manufacturers have."""
 
 _NUMBERS = ("scale", "offset", "min", "max", "deadband", "null")
 
@@ -182,7 +179,7 @@ def _columns(table: _Table, line: int, cells: list[str]) -> list[str]:
 def _cell(key: str, cell: str) -> Any:
     """The value of a cell, as YAML would have it."""
     if key == "area":
-        return _SHORT.get(cell.lower(), cell.lower())
+        return KNOWN_AREAS.get(cell.lower(), cell.lower())
     if key in _TEXT:
         return cell
     if key == "scale":

@@ -2,12 +2,27 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
+
 from holdfast.runtime.text import clip
 
 MAX_SHOWN = 60
 
 PATH_QUOTES = "write a path in single quotes, or with /"
 """What helps against `\\` in double quotes, where it begins an escape."""
+
+
+_FOREIGN_SPACE = re.compile(r"\s*([^\S\x00-\x7f])")
+
+
+def foreign_space(text: str) -> str | None:
+    """The first space that is none in YAML, of those before a text; `None` without one."""
+    found = _FOREIGN_SPACE.match(text)
+    if found is None:
+        return None
+    name = unicodedata.name(found[1], "").lower()
+    return f"the character U+{ord(found[1]):04X}{name and f' ({name})'}"
 
 
 def show(value: object) -> str:

@@ -5,6 +5,7 @@ It also accepts a `}` left of the key that it belongs to, which many write, and 
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 from ruamel.yaml import YAML
@@ -20,7 +21,7 @@ from ruamel.yaml.events import (
 )
 from ruamel.yaml.scanner import Scanner
 
-from holdfast.config.text.messages import PATH_QUOTES
+from holdfast.config.text.messages import PATH_QUOTES, foreign_space
 from holdfast.config.text.problems import ConfigError, Problem
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ MAX_KEY_LENGTH = 1024
 """Characters of a key without `?`, by YAML."""
 
 _QUOTES = "text that begins with [, { or a quote needs quotes around the whole, as in '[::1]:502'"
+
+_FORBIDDEN_START = re.compile("found character '([%@`])' that cannot start any token")
 
 _TAB = "found character '\\t' that cannot start any token"
 
@@ -68,7 +71,13 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
     if reason == _TAB and mark and mark.buffer[mark.pointer - mark.column : mark.pointer].strip():
         # It is YAML, but both parsers refuse it.
         return Problem(file, line, column, "", "a tab before a value, allowed: spaces")
-    if reason in PLAIN_REASONS:
+    if mark and (blank := _foreign_space(mark, start or mark)) is not None:
+        line, reason = blank
+        column = None
+    elif (character := _FORBIDDEN_START.fullmatch(reason)) is not None:
+        begin = f"text that begins with {character[1]} needs quotes around the whole"
+        reason = f"{begin}, as in unit: '%'"
+    elif reason in PLAIN_REASONS:
         reason = PLAIN_REASONS[reason]
     elif error.context and start and mark and start.line != mark.line:
         reason += f", {error.context} that starts in line {start.line + 1}"
@@ -77,6 +86,16 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
     if reason.startswith(("found unknown escape", "expected escape")):
         reason += f"; in double quotes, \\ begins an escape: {PATH_QUOTES}"
     return Problem(file, line, column, "", f"not YAML: {reason}")
+
+
+def _foreign_space(mark: Any, start: Any) -> tuple[int, str] | None:
+    """The line and the reason of an error that comes from a space that is none in YAML."""
+    first = max(min(start.line, mark.line - 1), 0)
+    for number, line in enumerate(mark.buffer.splitlines()[first : mark.line + 1], first + 1):
+        for part in (line, line.partition(":")[2]):
+            if (blank := foreign_space(part)) is not None:
+                return number, f"found {blank}, allowed: spaces"
+    return None
 
 
 def events(text: str, file: str) -> Iterator[YamlEvent]:

@@ -13,6 +13,7 @@ from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import either, listing
 from holdfast.tags import Tag, TagError
 from holdfast.tags.scale import Form, RegisterScale
+from holdfast.tags.text import decimal_comma
 from holdfast.types import AREAS, Area
 
 if TYPE_CHECKING:
@@ -76,6 +77,8 @@ def parse_scale(value: object) -> float | ScaleConfig:
         and -MAX_NUMBER <= value <= MAX_NUMBER
     ):
         return exact_number(value)
+    if (comma := decimal_comma(str(value))) is not None:
+        raise ValueError(f"{show(value)} {comma}")
     if not isinstance(value, dict):
         words = "a number, or a mapping with the keys from, as"
         raise ValueError(f"found {show(value)}, allowed: {words}")
