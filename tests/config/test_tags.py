@@ -351,7 +351,8 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
             "t.csv:2: tags.x.scale: '0,1' has a decimal comma, allowed: a decimal point, as in 0.1",
         ),
         ("t.csv", "a;hr;1\nsep=;\n", "t.csv:2: tags.'sep='"),
-        ("t.csv", "", "t.csv:1: tags: "),
+        ("t.csv", "", "t.csv:1: found no tags, allowed: one in each line"),
+        ("t.csv", "name,area,address\n", "t.csv:1: found no tags, allowed: one in each line"),
         ("t.yaml", "- a\n", "t.yaml:1: found a list, allowed: a mapping with the keys order"),
         ("t.yaml", "tags: {a: {area: coils}}\n", "t.yaml:1: tags.a.address: missing"),
         (
