@@ -434,6 +434,28 @@ def test_readable_ranges_without_holes_are_a_warning(
 
 
 @pytest.mark.parametrize(
+    ("tolerance", "pauses"),
+    [
+        ("pause_after_connect: 1, close_after: 1", "2 requests take 2 s"),
+        ("pause: 0.6", "2 requests take 1.2 s"),
+        ("reconnect: 3, close_after: 4", "2 requests take 1.5 s"),
+        ("pause: 0.4, pause_after_connect: 60, retries: 1", None),
+    ],
+)
+def test_pauses_that_last_longer_than_the_interval_are_a_warning(
+    folder: Folder, tolerance: str, pauses: str | None
+) -> None:
+    text = """
+devices:
+  meter: {url: tcp://a, interval: 1, tolerance: {%s}, tags: {
+    a: {area: coils, address: 1}, b: {area: holding_registers, address: 1}}}
+"""
+    message = f"found 1, but the pauses of {pauses} in each poll: polls are late"
+    found = folder.warnings(text % tolerance)
+    assert [each.partition("interval: ")[2] for each in found] == ([message] if pauses else [])
+
+
+@pytest.mark.parametrize(
     ("stale", "told"),
     [
         ("{after: 10}", []),

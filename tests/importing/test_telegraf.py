@@ -326,7 +326,6 @@ def test_workarounds_and_retries(imported: Callable[[str], Imported]) -> None:
     assert device(found)["tolerance"] == {
         "pause_after_connect": 2,
         "pause": 0.02,
-        "close_after": 1,
         "retries": 10,
         "retry_busy": True,
     }
@@ -336,8 +335,8 @@ def test_workarounds_and_retries(imported: Callable[[str], Imported]) -> None:
         "connections",
         "6: inputs.modbus[0].busy_retries_wait: left out: the pause before a retry is at least "
         "0.1 s; see pause of tolerance",
-        "21: inputs.modbus[0].workarounds.close_connection_after_gather: changed: the connection "
-        "is closed after each request",
+        "21: inputs.modbus[0].workarounds.close_connection_after_gather: left out: the "
+        "connection stays open: with close_after, each request would wait for pause_after_connect",
         "22: inputs.modbus[0].workarounds.one_request_per_field: left out: requests are planned "
         "from all tags; see max_registers and max_bits",
     ]
@@ -352,6 +351,15 @@ def test_inputs_of_one_controller_share_its_settings(imported: Callable[[str], I
         "18: inputs.modbus[1]: changed: devices at one address share pauses and retries: the "
         "largest value of each applies"
     ]
+    closing = "  [inputs.modbus.workarounds]\n    close_connection_after_gather = true\n"
+    found = imported(REGISTER + closing)
+    assert device(found)["tolerance"] == {"close_after": 1}
+    assert "changed: the connection is closed after each request" in notes(found)[0]
+    waiting = '  [inputs.modbus.workarounds]\n    pause_after_connect = "1s"\n'
+    found = imported(REGISTER + closing + REQUEST + waiting)
+    shared = [each["tolerance"] for each in found.data["devices"].values()]
+    assert shared == [{"pause_after_connect": 1}] * 3
+    assert any("left out: the connection stays open" in note for note in notes(found))
     second = changed("baud_rate = 9600", "baud_rate = 19200", SERIAL)
     assert problems(imported, SERIAL + second) == [
         "15: inputs.modbus[1].controller: the serial settings differ from those of the input at "

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from holdfast._core import CONTACTS_PER_LAG
+from holdfast.config import read_plans
 from holdfast.config.allowed_words import allowed
 from holdfast.config.checks.common import given, items, until_invalid
 from holdfast.config.checks.memories import area_of, check_memory
@@ -13,7 +14,7 @@ from holdfast.config.models.devices import TAKING_TIME, takes_writes
 from holdfast.config.text.messages import show
 from holdfast.net.addresses import joined
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_WORD
-from holdfast.runtime.text import either, extent
+from holdfast.runtime.text import counted, either, extent
 from holdfast.types import BIT_AREAS, REGISTER_AREAS, Area
 
 if TYPE_CHECKING:
@@ -273,6 +274,20 @@ def _stale_elsewhere(config: Config, device: DeviceConfig) -> Iterator[str]:
             )
 
 
+def _pauses(config: Config, name: str, device: DeviceConfig) -> tuple[float, int]:
+    """The seconds of a poll in which the tolerance of the device allows no request, at least, and
+    the number of requests of a poll."""
+    tolerance = device.target.tolerance
+    if not tolerance.has_pauses and not tolerance.reconnect:
+        return 0, 0
+    reads = [(read.area, read.address, read.count) for read in device.reads]
+    tags = [(tag.area, tag.span.start, len(tag.span)) for tag in config.tags(name)]
+    requests = len(read_plans.plan([*reads, *tags], read_plans.rules(device)).blocks)
+    connections = requests / tolerance.close_after if tolerance.close_after else 0
+    connecting = max(tolerance.reconnect + tolerance.pause_after_connect, tolerance.pause)
+    return connections * connecting + (requests - connections) * tolerance.pause, requests
+
+
 def _warnings(scope: Scope, path: KeyPath, device: DeviceConfig) -> Iterator[tuple[KeyPath, str]]:
     if not given(device, *TAKING_TIME):
         for key in given(device, *_OF_POLLING):
@@ -286,6 +301,11 @@ def _warnings(scope: Scope, path: KeyPath, device: DeviceConfig) -> Iterator[tup
     ):
         message = "pass has no effect: no coils are read into coils, and no holding registers"
         yield (*path, "writes"), f"{message} into holding registers"
+    if device.is_polled and device.interval is not None:
+        pauses, requests = _pauses(scope.config, str(path[-1]), device)
+        if pauses > device.interval:
+            found = f"found {device.interval:g}, but the pauses of {counted(requests, 'request')}"
+            yield (*path, "interval"), f"{found} take {pauses:g} s in each poll: polls are late"
     stored = any(read.into is not None for read in device.reads)
     if device.stale is not None:
         if device.reads and not stored:

@@ -164,8 +164,6 @@ class InputReader:
                 self.tolerance[option] = pause
         if table.flag("close_connection_after_gather"):
             self.tolerance["close_after"] = 1
-            message = "the connection is closed after each request"
-            table.changed("close_connection_after_gather", message)
         for key, option, most in (
             ("max_bit_registers_per_request", "max_bits", READ_BITS),
             ("max_word_registers_per_request", "max_registers", READ_REGISTERS),
@@ -266,13 +264,14 @@ class InputReader:
 def share_connections(desk: Desk, devices: list[Device]) -> None:
     """Gives devices at one address the same tolerance: the largest value of each setting.
 
-    Reports different settings of one serial line.
+    Reports different settings of one serial line, and when connections are closed.
     """
     groups: dict[str, list[Device]] = {}
     for each in devices:
         if each.data["url"] is not None:
             groups.setdefault(connection_of(parse(each.data["url"])), []).append(each)
     for group in groups.values():
+        _close_connections(desk, group)
         shared: dict[str, Any] = {}
         for each in group:
             for key, value in each.data.get("tolerance", {}).items():
@@ -283,6 +282,22 @@ def share_connections(desk: Desk, devices: list[Device]) -> None:
                 message = "devices at one address share pauses and retries"
                 desk.changed(each.path[:-1], f"{message}: the largest value of each applies")
                 each.data["tolerance"] = dict(shared)
+
+
+def _close_connections(desk: Desk, group: list[Device]) -> None:
+    """Keeps the connection of devices open if each request would wait after connecting.
+
+    The source connected once for all requests of a poll.
+    """
+    own = [each.data.get("tolerance", {}) for each in group]
+    waits = any(tolerance.get("pause_after_connect") for tolerance in own)
+    for each, tolerance in zip(group, own, strict=True):
+        path = (*each.path[:-1], "workarounds", "close_connection_after_gather")
+        if waits and tolerance.pop("close_after", None):
+            message = "the connection stays open: with close_after, each request would wait for"
+            desk.left_out(path, f"{message} pause_after_connect")
+        elif tolerance.get("close_after"):
+            desk.changed(path, "the connection is closed after each request")
 
 
 def _compare_lines(desk: Desk, first: Device, other: Device) -> None:
