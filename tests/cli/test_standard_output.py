@@ -41,6 +41,20 @@ def test_a_full_disk_is_one_line_of_error(words: Sequence[str]) -> None:
 
 
 @with_full
+def test_a_full_standard_error_changes_no_exit_code(tmp_path: Path) -> None:
+    config = tmp_path / "plant.yaml"
+    device = "devices: {a: {url: tcp://a, interval: 1, tags: {x: {area: coils, address: %s}}, %s}}"
+    # Python prints the error again at its end, unless it does not buffer.
+    env = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+    for address, code in ((1, 0), (-1, 2)):
+        config.write_text(device % (address, "tolerance: {pause: 2}"))  # Warns of the pause.
+        with FULL.open("wb") as full:
+            words = [*HOLDFAST, "check", str(config)]
+            ended = subprocess.run(words, stdout=subprocess.PIPE, stderr=full, env=env, check=False)
+        assert ended.returncode == code
+
+
+@with_full
 def test_tags_that_a_full_disk_leaves_unwritten_are_named(tmp_path: Path) -> None:
     tags = tmp_path / "tags.yaml"
     place = "area: holding_registers, writable: true"

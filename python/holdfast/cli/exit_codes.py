@@ -6,9 +6,7 @@ import sys
 from enum import IntEnum
 from typing import NoReturn
 
-import click
-
-from holdfast.cli import answers
+from holdfast.cli import answers, standard_output
 
 
 class ExitCode(IntEnum):
@@ -41,5 +39,5 @@ def fail(
     if answers.wanted() and not is_printed:
         answers.print_wrong(reason, message, target)
     elif not is_printed:
-        click.echo(f"{prefix}{message}", err=True)
+        standard_output.print_error(f"{prefix}{message}")
     sys.exit(code)

@@ -1,14 +1,17 @@
 """Standard output that can't take what a command prints: another encoding, a full disk, a reader
-that is gone or does not read, a stream that is closed.
+that is gone or does not read, a stream that is closed. Of standard error, what concerns exit codes.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
 import sys
 from pathlib import Path
+
+import click
 
 _UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EPIPE)
 
@@ -57,8 +60,22 @@ def _number(error: OSError) -> int:
     return error.errno or 0
 
 
-def leave() -> None:
+def leave(stream: int = 1) -> None:
     """Drops what is not printed: Python would fail again at its end."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
+    os.dup2(nowhere, stream)
     os.close(nowhere)
+
+
+def print_error(line: object) -> None:
+    """Prints a line on standard error. If that can't be written, the exit code is the same."""
+    with contextlib.suppress(OSError):
+        click.echo(line, err=True)
+
+
+def end_errors() -> None:
+    """Drops what standard error can't take: the exit code of Python would be another one."""
+    try:
+        sys.stderr.flush()
+    except OSError:
+        leave(2)
