@@ -449,6 +449,19 @@ def test_show_names_what_a_certificate_fails(tmp_path: Path) -> None:
     assert "superseded" in invoke("cert", "show", str(listed)).stdout
 
 
+def test_show_prints_no_warning_about_a_negative_serial_number(plant: Pki) -> None:
+    old = plant / "old.pem"
+    der = ssl.PEM_cert_to_DER_cert((plant / "ca.pem").read_text().strip())
+    number = plant.certificate("ca.pem").serial_number
+    positive = number.to_bytes(number.bit_length() // 8 + 1, "big")
+    negative = b"\x80" + positive[1:]
+    old.write_text(ssl.DER_cert_to_PEM_cert(der.replace(positive, negative)))
+    command = [sys.executable, "-m", "holdfast", "cert", "show", str(old)]
+    shown = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert "serial      -" in shown.stdout
+    assert shown.stderr == ""
+
+
 def test_show_names_a_key_that_does_not_fit(plant: Pki) -> None:
     both = plant / "both.pem"
     both.write_bytes((plant / "plc.pem").read_bytes() + (plant / "panel.key").read_bytes())
