@@ -103,7 +103,8 @@ class SuggestingGroup(click.Group):
         """The command of the arguments."""
         name = args[0]
         known = self.list_commands(ctx)
-        if name not in known and not name.startswith("-"):
+        # A shell that completes a line shows no errors.
+        if name not in known and not name.startswith("-") and not ctx.resilient_parsing:
             typed = {**{each: each for each in known}, **self.old_names}
             ctx.fail(f"No such command {name!r}.{_suggestion(name, typed)}")
         return super().resolve_command(ctx, args)
@@ -196,7 +197,6 @@ class Program(SuggestingGroup):
             with sparing:
                 return _imported(COMMANDS[cmd_name])
         except ModuleNotFoundError:
-            # A shell that completes a line shows no errors.
             if ctx.resilient_parsing:
                 return None
             raise
