@@ -352,7 +352,7 @@ def test_a_modicon_number_names_area_and_address(
         (("%IW3",), "'%IW3' is not clear: type ir:3 or, with CODESYS, hr:3."),
         (("%MB3",), "'%MB3' is not an item, allowed: %MW0 for hr:0, %M0 for co:0"),
         (("holdng_registers", "0"), "did you mean 'holding_registers'?"),
-        (("hr:0", "--type", "flaot32"), "AREA:ADDRESS and tags"),
+        (("hr:0", "--type", "flaot32"), "did you mean 'float32'?"),
         (("hr:0:flaot32",), "did you mean 'float32'?"),
         (("hr:0:real",), "did you mean 'float32'?"),
         (("hr:0:u16",), "did you mean 'uint16'?"),
@@ -468,7 +468,8 @@ def test_an_item_is_written_in_many_ways(server: holdfast.Server, memory: holdfa
     for text in ("hr:0 2", "hr:0-1", "40001 2", "%MW0 2"):
         assert cli.answer("read", url, *text.split())["registers"] == [1, 2]
     assert cli.answer("read", url, "hr:0:UINT32", "2")["values"] == [0x10002, 0x30004]
-    assert cli.answer("read", url, "hr", "0:uint32")["values"] == [0x10002]
+    for text in ("hr 0:uint32", "hr 0 --type uint32", "hr:0 --type uint32"):
+        assert cli.answer("read", url, *text.split())["values"] == [0x10002]
     found = cli.answer("read", url, "4x0001", "%MW1", "hr", "2", "hr:3:int16")
     assert found["values"] == {"hr:0": 1, "hr:1": 2, "hr:2": 3, "hr:3": 4}
 

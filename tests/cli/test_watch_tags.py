@@ -147,7 +147,7 @@ def test_a_device_that_does_not_answer_can_not_be_watched() -> None:
         (("tcp://127.0.0.1", "hr:0", "--memory", "x"), "--memory requires FILE."),
         (("plant.yaml", "hr:0"), "AREA:ADDRESS and --tags require URL, not FILE."),
         (("plant.yaml", "--tags", "x.yaml"), "AREA:ADDRESS and --tags require URL, not FILE."),
-        (("tcp://127.0.0.1", "hr", "0", "--csv"), "--csv requires AREA:ADDRESS or --tags."),
+        (("tcp://127.0.0.1", "hr", "0", "--csv"), "--csv requires --tags, or each value"),
         (("foo://127.0.0.1", "hr:0"), "is not the URL of a device"),
     ],
 )

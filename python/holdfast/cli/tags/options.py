@@ -72,7 +72,9 @@ class Selection:
         for name, value in asdict(self).items():
             if value:
                 name = name.replace("_", "-")
-                raise click.UsageError(f"--{name} requires AREA:ADDRESS or --tags.")
+                raise click.UsageError(
+                    f"--{name} requires --tags, or each value as an item, as in hr:0 hr:1:int16."
+                )
 
 
 tag_file_options = option_group(
@@ -121,12 +123,16 @@ def device_of(
     `typed` are the values of `--type`, `--order` and `--encoding`.
     """
     kind, order, encoding = typed
-    if not files.given and not item.are_several(words):
+    is_typed = kind is not None or order != "ABCD"
+    if not files.given and ((is_typed and len(words) == 1) or not item.are_several(words)):
         return None
     from holdfast.cli.tags import selection
 
-    if kind is not None or order != "ABCD":
-        raise click.UsageError("--type and --order can't be used with AREA:ADDRESS and tags.")
+    if is_typed:
+        raise click.UsageError(
+            "--type and --order can't be used with tags or several items; an item can have its "
+            "own, as in hr:0:float32:CDAB."
+        )
     if files.given:
         if encoding is not None:
             raise click.UsageError("--encoding can't be used with tags.")
