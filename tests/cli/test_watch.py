@@ -514,6 +514,19 @@ def test_the_size_of_the_terminal_may_change(server: holdfast.Server) -> None:
         assert terminal.end() == 0
 
 
+def test_changes_leave_room_for_values_and_keys(
+    server: holdfast.Server, memory: holdfast.Memory
+) -> None:
+    arguments = ("watch", cli.url(server), "hr", "0", "8", "--every", "0.05")
+    with Terminal(*arguments, lines=10, columns=100) as terminal:
+        terminal.until("q quits")
+        memory.write("holding_registers", 0, range(1, 9))
+        terminal.until("changing")
+        terminal.until("holding_registers", "    0      1     2", "changing", "q quits")
+        terminal.resize(6, 20)
+        terminal.until("holding_registers", "    0      1     2", "    2      3     4", "q quits")
+
+
 def test_pages_are_turned(server: holdfast.Server) -> None:
     arguments = ("watch", cli.url(server), "hr", "0", "300", "--every", "0.05")
     with Terminal(*arguments, lines=20, columns=60) as terminal:

@@ -32,6 +32,12 @@ SIZE_CHECK_INTERVAL_S = 0.2
 FADE_READINGS = 3
 """A change stays highlighted for so many readings."""
 
+MIN_BODY_LINES = 3
+"""The lines of a page that the foot leaves on a terminal with few lines: a heading and two more."""
+
+MIN_FOOT_LINES = 2
+"""Fewer lines of the foot, which would be its heading alone, are not shown."""
+
 GAP = "   "
 """Between the parts of a line."""
 
@@ -141,8 +147,9 @@ class Screen(ABC):
     def _draw(self) -> None:
         self._drawn = time.monotonic()
         self._size = width, height = self._console.size
-        foot = self.foot(width)
         body = self.body(width)
+        most = height - 4 - min(len(body), MIN_BODY_LINES)
+        foot = self.foot(width)[:most] if most >= MIN_FOOT_LINES else []
         room = max(1, height - 3 - (len(foot) + 1 if foot else 0))
         self._pages = pages = max(1, math.ceil(len(body) / room))
         self._page = min(self._page, pages - 1)
@@ -151,6 +158,7 @@ class Screen(ABC):
         if foot:
             lines += [Text(), *foot]
         lines += [Text()] * (height - 1 - len(lines))
+        del lines[height - 1 :]
         lines.append(self._keys(width))
         for line in lines:
             line.truncate(width, overflow="ellipsis")
