@@ -270,6 +270,29 @@ def test_a_file_is_added(opened: Opened, tmp_path: Path) -> None:
     expect(tag(view, "room")).to_have_text("123.4")
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("latin.csv", "name,area,address,unit\na,hr,0,°C\n".encode("latin-1"), "not UTF-8"),
+        ("wide.csv", "name,area,address\na,hr,0\n".encode("utf-16"), "not UTF-8"),
+        ("binary.csv", b"a,hr,0,\0", "tags:1: the character U+0000 is not allowed in CSV"),
+        ("typo.yaml", b"tagss:\n  a: {area: holding_registers, address: 0}\n", "tags:1: tagss: "),
+    ],
+)
+def test_a_file_that_is_no_list_is_told(
+    opened: Opened, tmp_path: Path, name: str, content: bytes, told: str
+) -> None:
+    view = connected(opened)
+    view.button("Add tag list…").click()
+    file = tmp_path / name
+    file.write_bytes(content)
+    view.page.locator("#tags-file").set_input_files(file)
+    if not told.startswith("not"):
+        expect(view.page.get_by_role("textbox", name="YAML or CSV")).not_to_be_empty()
+        view.button("Add").click()
+    expect(view.page.get_by_role("alert").filter(has_text=told)).to_be_visible()
+
+
 # Writing.
 
 

@@ -134,6 +134,7 @@ class _Table:
 
 
 def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:
+    yaml_document.require_allowed(text, file, "CSV")
     table, columns = _Table(file), list[str]()
     sample = next((line for line in text.splitlines() if line.strip() and line[0] != "#"), "")
     separator = max(",;\t", key=sample.count)

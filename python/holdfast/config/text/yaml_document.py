@@ -200,6 +200,13 @@ def decoded(data: bytes, file: str, form: str = "YAML") -> str:
         raise _error(file, f"not UTF-8, allowed: {form} in UTF-8", line) from None
 
 
+def require_allowed(text: str, file: str, form: str = "YAML") -> None:
+    """Refuses control characters, as of a binary file. Raises `ConfigError`."""
+    if found := _NOT_ALLOWED.search(text):
+        line = text[: found.start()].count("\n") + 1
+        raise _error(file, f"the character U+{ord(found[0]):04X} is not allowed in {form}", line)
+
+
 def read_bytes(
     path: Path, file: str, max_bytes: int = MAX_BYTES, *, named_pipe: bool = True
 ) -> bytes:
@@ -253,9 +260,7 @@ class _TooMany(Exception):
 
 
 def _events(text: str, file: str, max_written: int) -> Iterable[YamlEvent]:
-    if found := _NOT_ALLOWED.search(text):
-        line = text[: found.start()].count("\n") + 1
-        raise _error(file, f"the character U+{ord(found[0]):04X} is not allowed in YAML", line)
+    require_allowed(text, file)
     # Text without a value has no events, from either parser.
     if events := yaml_events(text, max_written):
         return events

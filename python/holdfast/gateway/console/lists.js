@@ -4,8 +4,21 @@ import { get, post } from "./api.js";
 import { $, h, once } from "./dom.js";
 import { list } from "./parts.js";
 
-/** Returns the format of a tag list. */
-const formatOf = (name, text) => (/\.csv$/i.test(name) || !/^\s*(order|tags)\s*:/m.test(text) ? "csv" : "yaml");
+/** Returns the format of a tag list: by the end of the name of its file, or else by its content. */
+const formatOf = (name, text) => {
+  if (/\.csv$/i.test(name)) return "csv";
+  return /\.(ya?ml|json)$/i.test(name) || /^\s*(order|tags)\s*:/m.test(text) ? "yaml" : "csv";
+};
+
+/** Returns the text of a file. Throws an error for one that is not UTF-8, whose text would be damaged. */
+async function textOf(file) {
+  const content = await file.arrayBuffer();
+  try {
+    return new TextDecoder("utf-8", { fatal: true }).decode(content);
+  } catch {
+    throw new Error(`${file.name}: not UTF-8, allowed: YAML or CSV in UTF-8; save it as UTF-8`);
+  }
+}
 
 /** The dialog for tag lists. `add` takes the part that was chosen, or throws an error. */
 export class Lists {
@@ -19,10 +32,11 @@ export class Lists {
       const [file] = $("tags-file").files;
       if (!file) return;
       const { signal } = this.closing;
-      const text = await file.text();
+      const [text, problem] = await textOf(file).then((found) => [found, ""], (error) => ["", error.message]);
       if (signal.aborted) return;
-      this.name = file.name;
+      this.name = problem ? "" : file.name;
       $("tags-text").value = text;
+      $("tags-error").textContent = problem;
       $("tags-profile").value = "";
       this.adapt();
     });
