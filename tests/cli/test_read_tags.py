@@ -252,7 +252,7 @@ def test_an_incomplete_line_of_a_recording_is_removed(
 TEXTS = "tags: {t: {area: holding_registers, address: 0, type: 'string:12', encoding: latin-1}}"
 
 
-@pytest.mark.parametrize("text", ["A\nB", "A\rB", 'a"\n"b', " \\x0a,\x1b; "], ids=ascii)
+@pytest.mark.parametrize("text", ["A\nB", "A\rB", "A\0B", 'a"\n"b', " \\x0a,\x1b; "], ids=ascii)
 def test_a_recorded_text_is_played_back(
     server: holdfast.Server, memory: holdfast.Memory, tmp_path: Path, text: str
 ) -> None:

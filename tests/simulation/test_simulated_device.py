@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import itertools
 import math
@@ -298,7 +299,8 @@ def test_usual_values_fit_into_every_type() -> None:
         SimulatedDevice(TagList([tag]))
 
 
-def test_values_are_played_back_and_begin_again(tmp_path: Path) -> None:
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_values_are_played_back_and_begin_again(tmp_path: Path, separator: str) -> None:
     tags = TagList(
         [
             Tag("t", "holding_registers", 0, "int16", scale=0.1),
@@ -307,7 +309,8 @@ def test_values_are_played_back_and_begin_again(tmp_path: Path) -> None:
         ]
     )
     file = tmp_path / "values.csv"
-    file.write_text('time,t,door,pair\n1,21.5,true,"[1,2]"\n2,,false,"[3,4]"\n')
+    text = 'time|t|door|pair\n1|21.5|true|"[1,2]"\n2||false|"[3,4]"\n'
+    file.write_text(text.replace("|", separator))
     device = SimulatedDevice(tags, played=playback.load(file, tags).values)
     found = []
     for _ in range(3):
@@ -399,6 +402,8 @@ def test_a_state_is_played_back_by_its_name(tmp_path: Path) -> None:
         ("t\n1\nmuch\n", ":3: t: 'much' is not a number"),
         ("time,t\n1\n", ":2: found 1 cells, allowed: 2"),
         ('t\n"1,5"\n', ":2: t: '1,5' has a decimal comma"),
+        ("time;t\n1;1,5\n", ":2: t: '1,5' has a decimal comma"),
+        (codecs.BOM_UTF16_LE.decode("latin-1"), "a file in UTF-16, allowed: CSV in UTF-8"),
         ("t\n1e999\n", ":2: t: '1e999' is not a finite number"),
         ("t\ninf\n", ":2: t: 'inf' is not a number"),
         ("t\n1\n70000\n", r":3: t holds 0 to 65535 \(uint16\), found 70000; the nearest is 65535"),
@@ -408,7 +413,7 @@ def test_a_file_that_can_not_be_played_back_is_refused(
     tmp_path: Path, text: str, message: str
 ) -> None:
     file = tmp_path / "values.csv"
-    file.write_text(text)
+    file.write_text(text, encoding="latin-1")
     tags = TagList([Tag("t", "holding_registers", 0)])
     with pytest.raises(playback.Unplayable, match=message):
         playback.load(file, tags)

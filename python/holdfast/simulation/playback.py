@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import csv
+import io
 from itertools import chain, repeat
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from holdfast.config.text import yaml_document
+from holdfast.config.text.problems import ConfigError
 from holdfast.simulation.capacity import Capacity
 from holdfast.tags.strict_text import from_text
-from holdfast.tags.text import value_from
+from holdfast.tags.text import csv_separator, value_from
 from holdfast.values import DoesNotFit
 
 if TYPE_CHECKING:
@@ -44,11 +47,17 @@ def load(path: Path, tags: TagList) -> Played:
 
     Raises `Unplayable`, which names file and line, and `OSError`.
     """
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        try:
-            return _columns(csv.reader(file), str(path), tags)
-        except (csv.Error, UnicodeDecodeError) as error:
-            raise Unplayable(f"{path}: not CSV: {error}") from error
+    try:
+        # A text that a device has, and its recording, may contain NUL.
+        text = yaml_document.decoded(path.read_bytes(), str(path), "CSV", may_have_nul=True)
+        lines = io.StringIO(text, newline="")
+        separator = csv_separator(lines.readline())
+        lines.seek(0)
+        return _columns(csv.reader(lines, delimiter=separator), str(path), tags)
+    except ConfigError as error:
+        raise Unplayable(str(error)) from error
+    except csv.Error as error:
+        raise Unplayable(f"{path}: not CSV: {error}") from error
 
 
 def _columns(rows: Any, file: str, tags: TagList) -> Played:

@@ -81,6 +81,11 @@ def csv_lines(rows: Iterable[Iterable[object]]) -> str:
     return "".join(lines)
 
 
+def csv_separator(line: str) -> str:
+    """The separator of a CSV file by its first line: spreadsheets may use another than a comma."""
+    return max(",;\t", key=line.count)
+
+
 class _Lines(list[str]):
     """Takes the lines of a CSV writer, one at a time."""
 

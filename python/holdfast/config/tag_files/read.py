@@ -20,7 +20,7 @@ from holdfast.config.values.tag_scale import FORMS, PLACE_KEYS
 from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import listing
 from holdfast.tags import TagList
-from holdfast.tags.text import decimal_comma
+from holdfast.tags.text import csv_separator, decimal_comma
 from holdfast.types import KNOWN_AREAS
 
 if TYPE_CHECKING:
@@ -137,8 +137,7 @@ def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:
     yaml_document.require_allowed(text, file, "CSV")
     table, columns = _Table(file), list[str]()
     sample = next((line for line in text.splitlines() if line.strip() and line[0] != "#"), "")
-    separator = max(",;\t", key=sample.count)
-    rows = csv.reader(io.StringIO(text, newline=None), delimiter=separator, strict=True)
+    rows = csv.reader(io.StringIO(text, newline=None), delimiter=csv_separator(sample), strict=True)
     first = 1
     try:
         for row in rows:

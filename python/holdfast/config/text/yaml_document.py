@@ -187,11 +187,11 @@ def _error(file: str, message: str, line: int | None = None) -> ConfigError:
     return ConfigError(file, [Problem(file, line, None, "", message)])
 
 
-def decoded(data: bytes, file: str, form: str = "YAML") -> str:
+def decoded(data: bytes, file: str, form: str = "YAML", *, may_have_nul: bool = False) -> str:
     """Decodes the content of a file, which has to be of the `form`. Raises `ConfigError`."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise _error(file, f"a file in UTF-16, allowed: {form} in UTF-8; save it as UTF-8")
-    if b"\0" in data:
+    if b"\0" in data and not may_have_nul:
         raise _error(file, f"a binary file, allowed: {form} in UTF-8")
     try:
         return data.decode("utf-8-sig")
