@@ -226,14 +226,25 @@ def test_readings_are_repeated_and_recorded(
     assert len(record.read_text().splitlines()) == 4
 
 
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"time,other\n1,2\n", "found 'time,other' in the first line, allowed: 'time,hr:0'"),
+        (b"time,hr:0,hr:1\n", "found 'time,hr:0,hr:1' in the first line, allowed"),
+        (b"\x1b" * 100, r"\x1b\x1b'… in the first line, allowed"),
+        (
+            b"\xef\xbb\xbftime,hr:0\r\n",
+            r"found '\ufefftime,hr:0\r' in the first line, as a spreadsheet has saved it, allowed",
+        ),
+    ],
+)
 def test_a_recording_with_other_columns_is_not_touched(
-    server: holdfast.Server, tmp_path: Path
+    server: holdfast.Server, tmp_path: Path, content: bytes, told: str
 ) -> None:
     record = tmp_path / "values.csv"
-    record.write_text("time,other\n1,2\n")
-    wrong = usage_error("read", cli.url(server), "hr:0", "--record", str(record))
-    assert "found 'time,other' in the first line, allowed: 'time,hr:0'" in wrong
-    assert record.read_text() == "time,other\n1,2\n"
+    record.write_bytes(content)
+    assert told in usage_error("read", cli.url(server), "hr:0", "--record", str(record))
+    assert record.read_bytes() == content
 
 
 @pytest.mark.parametrize("torn", ["2026-01-01T00:00:00.000Z,23", "2"])

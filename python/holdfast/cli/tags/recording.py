@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import os
 import stat
@@ -9,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.cli import terminal_text
 from holdfast.events import log_lines
+from holdfast.runtime.text import MAX_CHARACTERS
 from holdfast.tags.text import csv_lines, text_of
 
 if TYPE_CHECKING:
@@ -71,13 +73,17 @@ class Recording:
         if not stat.S_ISREG(about.st_mode) or about.st_size == 0:
             self._append(head)
             return
-        found = self._at(0, len(head))
-        if not head.startswith(found):
-            first = found.partition(b"\n")[0].decode(errors="replace")
-            allowed = head.decode().rstrip()
+        most = len(head) + MAX_CHARACTERS
+        found = self._at(0, most)
+        if not head.startswith(found[: len(head)]):
+            first, end, _ = found.partition(b"\n")
+            more = "" if end or len(found) < most else "…"
+            allowed = head.strip()
+            is_resaved = end and first.removeprefix(codecs.BOM_UTF8).strip() == allowed
+            reason = ", as a spreadsheet has saved it" if is_resaved else ""
             raise NotARecording(
-                f"found {terminal_text.plain(first)!r} in the first line, allowed: {allowed!r}, "
-                "an empty file or a new one"
+                f"found {first.decode(errors='replace')!r}{more} in the first line{reason}, "
+                f"allowed: {allowed.decode()!r}, an empty file or a new one"
             )
         whole = self._whole()
         if about.st_size - whole > MAX_LINE_BYTES:
