@@ -185,6 +185,8 @@ def test_a_command_prints_its_keys(
             for each in (found, *found.get("found", ())):
                 assert set(each) <= shared | own.get(name, set())
             assert ("target" in found) == (name not in NO_TARGET)
+            if name.startswith("import "):
+                assert found["target"] == words.split()[0].format(**names)
             if is_good:
                 assert "reason" not in found
             else:

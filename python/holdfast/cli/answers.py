@@ -10,8 +10,8 @@ import click
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-TARGETS = ("url", "target", "targets", "receiver", "fleet", "file", "files")
-"""The parameters of commands that say what they talk to."""
+TARGETS = ("file", "files", "url", "target", "targets", "receiver", "fleet")
+"""The parameters of commands that say what they talk to; a URL beside a file is an option."""
 
 _COMMAND = f"{__name__}.command"
 """The place in `meta` of the context of the command that has `--json`."""
