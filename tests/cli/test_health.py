@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -72,7 +74,7 @@ def test_an_appliance_that_serves_is_ready_until_it_ends(
     result = invoke("health", file)
     assert (result.exit_code, result.stdout) == (1, "")
     assert result.stderr.startswith(f"holdfast: {url}/health/ready: ")
-    assert "refused" in answer("health", file, code=1)["detail"]
+    assert answer("health", file, code=1)["detail"] == os.strerror(errno.ECONNREFUSED)
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system has no /proc")

@@ -663,6 +663,4 @@ def connect_failed(target: NetworkTarget, error: OSError) -> ConnectFailed:
 
 def explained(error: Exception) -> str:
     """The system's text for an error, without the address that asyncio adds."""
-    if isinstance(error, socket.gaierror):
-        return error.strerror or str(error)
     return os_error_text(error) if isinstance(error, OSError) else str(error)

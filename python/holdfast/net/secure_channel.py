@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from holdfast._core import Endpoint, TlsChannel
 from holdfast.protocol import TLS_PORT
 from holdfast.runtime.bounded_files import require_stored
+from holdfast.runtime.text import os_error_text
 
 if TYPE_CHECKING:
     from holdfast.net.tls import Tls
@@ -21,8 +22,11 @@ class TlsRefused(ConnectionError):
 
 
 def failure_text(error: BaseException) -> str:
-    """Returns why a connection to a broker failed, for people; for TLS, the reason comes first."""
-    text = str(error) or type(error).__name__
+    """Returns why a connection to a service failed, for people; for TLS, the reason comes first."""
+    text = str(error)
+    if isinstance(error, OSError) and error.filename is None:
+        text = os_error_text(error)
+    text = text or type(error).__name__
     return f"{error.reason}: {text}" if isinstance(error, TlsRefused) else text
 
 

@@ -82,6 +82,9 @@ def error_text(number: int) -> str:
 
 def os_error_text(error: OSError) -> str:
     """The system's text for an error. On Windows, `errno` is often 22 for want of a better one."""
+    # Errors of lookups and of TLS have numbers of their own.
+    if error.strerror and type(error).__module__ != "builtins":
+        return error.strerror
     if sys.platform == "win32" and error.winerror:
         import ctypes
 

@@ -21,6 +21,7 @@ from holdfast.cli.options.tls import tls_options
 from holdfast.cli.terminal_text import plain, print_json, show_problems, table
 from holdfast.net.addresses import admits, joined, reachable
 from holdfast.net.http import health as probes
+from holdfast.net.secure_channel import failure_text
 from holdfast.runtime.bounded_files import require_stored
 
 if TYPE_CHECKING:
@@ -173,7 +174,7 @@ def _response(
         return _NoAnswer(f"no answer in {timeout:g} s")
     # `ValueError`: the host is not a valid name.
     except (OSError, http.client.HTTPException, ValueError) as error:
-        return _NoAnswer(plain(str(error)) or type(error).__name__)
+        return _NoAnswer(plain(failure_text(error)))
     try:
         answer = json.loads(body)
         is_well, checks = answer["ok"] is True, answer["checks"]
