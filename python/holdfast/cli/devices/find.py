@@ -6,6 +6,7 @@ import re
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from holdfast.cli.devices.find_hosts import (
     MAX_ADDRESSES,
@@ -18,7 +19,7 @@ from holdfast.cli.devices.find_units import find_units
 from holdfast.cli.options.duration import Duration, time_option, timeout_option
 from holdfast.cli.options.option import DecimalNumber, flag, json_option, number_option, option
 from holdfast.cli.options.units import unit_ids
-from holdfast.cli.options.url import checked_url, is_serial_device
+from holdfast.cli.options.url import checked_url, is_serial_device, is_url
 from holdfast.client.serial_settings import SerialTarget
 from holdfast.client.url import parse
 from holdfast.config.values.ip_addresses import parse_source
@@ -40,6 +41,14 @@ _UNITS_HELP = (
     "Unit ids to ask, as in 1-10,255.  [default: 1, 255 and 0 of each host of a NETWORK, "
     f"1-{MAX_SERIAL_UNIT} of a URL, 1-10 on a serial line]"
 )
+
+
+_ONLY_FOR = {
+    **dict.fromkeys(("port", "rate", "large"), "NETWORK"),
+    "delay": "URL",
+    **dict.fromkeys(("bauds", "parities"), "SERIAL"),
+}
+"""The targets of parameters that not all have."""
 
 
 def _bauds(text: str) -> tuple[int, ...]:
@@ -98,19 +107,33 @@ def find(
             raise click.UsageError("Give one URL or one serial line, or several networks.")
         [target] = targets
         if "://" not in target:
+            _refuse_options_of_others("SERIAL")
             find_line("rtu", target, asked, bauds, parities, timeout or LINE_TIMEOUT_S, as_json)
             return
         checked_url(target)
         parsed = parse(target)
         if isinstance(parsed, SerialTarget) and "?" not in target:
+            _refuse_options_of_others("SERIAL")
             wait = timeout or LINE_TIMEOUT_S
             find_line(parsed.mode, parsed.device, asked, bauds, parities, wait, as_json)
             return
+        _refuse_options_of_others("URL")
         find_units(target, asked or device_search.GATEWAY_UNITS, timeout or 1.0, delay, as_json)
         return
+    _refuse_options_of_others("NETWORK")
     networks = _networks(targets, large)
     units = asked or device_search.HOST_UNITS
     find_hosts(" ".join(targets), networks, port, units, timeout or 1.0, rate, as_json)
+
+
+def _refuse_options_of_others(kind: str) -> None:
+    """Refuses options that have no effect on a target of this kind. Raises `click.UsageError`."""
+    context = click.get_current_context()
+    for param in context.command.params:
+        name = str(param.name)
+        whose = _ONLY_FOR.get(name, kind)
+        if whose != kind and context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"{param.opts[0]} is for {whose}, it can't be used with {kind}.")
 
 
 def _networks(texts: Iterable[str], large: bool) -> list[Network]:
@@ -119,11 +142,12 @@ def _networks(texts: Iterable[str], large: bool) -> list[Network]:
         try:
             networks.append(parse_source(text))
         except ValueError as error:
-            if re.fullmatch(r"[0-9./:a-fA-F]+", text):
+            if re.fullmatch(r"[0-9./:a-fA-F]+", text) and not is_url(text):
                 raise click.UsageError(str(error)) from error
             raise click.UsageError(
                 f"{text!r} is not a network (192.168.0.0/24), a URL or a serial line "
                 f"(/dev/ttyUSB0). For the unit ids behind a host, type 'holdfast find tcp://{text}'."
+                " The port of the hosts of a network is --port."
             ) from error
     check_size(networks, large=large)
     return networks
