@@ -920,6 +920,7 @@ def test_it_needs_an_egress_list() -> None:
         (("--allow", "10.0.0.0/8", "--host", "10.0.0.5"), "a host name without a port"),
         (("--allow", "10.0.0.0/8", "--compat", "tentacle"), "port-of-call"),
         (("--allow", "10.0.0.0/8", "--source", "10.0.0.0/8"), "--tokens"),
+        (("--allow", "10.0.0.0/8", "--bind", "0.0.0.0"), "clients that may connect with --source"),
         (("--allow", "10.0.0.0/8", "--tokens", "/nowhere"), "No such file"),
         (("--allow", "10.0.0.0/8", "--in-flight", "0"), "--in-flight"),
     ],

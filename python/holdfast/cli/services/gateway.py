@@ -10,7 +10,7 @@ import click
 
 from holdfast.appliance.services.gateway import gateway_settings
 from holdfast.appliance.services.services import https as loaded_https
-from holdfast.cli.options.bind_and_source import bind_option, source_option
+from holdfast.cli.options.bind_and_source import bind_option, require_source, source_option
 from holdfast.cli.options.log_lines import log_format_option
 from holdfast.cli.options.option import choice, number_option, option, parsed_by
 from holdfast.cli.options.tls import DEVICES, https_options, tls_options
@@ -88,6 +88,7 @@ def gateway(
 
     Exit codes: 0 stopped by a signal, 1 can't listen, 2 wrong usage.
     """
+    require_source(bind, sources)
     sources = sources or LOOPBACK
 
     def load() -> Config:
