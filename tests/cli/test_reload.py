@@ -197,6 +197,7 @@ def test_sessions_are_listed_and_ended(running: Running) -> None:
         assert second.rest() == b""
         assert first.ask(WRITE) == WRITE
         (left,) = answer("sessions", str(running.file))["sessions"]
+        assert left["session"] == ids[0]
         assert (left["listener"], left["id"], left["peer"]) == ("scada", 0, peers[0])
         gone = failure("sessions", str(running.file), "--end", ids[1])
         assert gone == ["holdfast: scada/1: no such connection"]

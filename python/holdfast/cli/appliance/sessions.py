@@ -39,7 +39,8 @@ def sessions(file: Path, as_json: bool, ending: str | None) -> None:
     except NotRunning as error:
         fail(error, reason="connection")
     if as_json:
-        print_json({"ok": True, "target": str(file), "sessions": found}, indent=2)
+        listed = [{"session": _id(each), **each} for each in found]
+        print_json({"ok": True, "target": str(file), "sessions": listed}, indent=2)
     elif found:
         click.echo("\n".join(table(_HEAD, map(_row, found))))
     else:
@@ -55,9 +56,14 @@ def _end(file: Path, ending: str) -> None:
         fail(f"{ending}: no such connection")
 
 
+def _id(session: dict[str, Any]) -> str:
+    """What `--end` takes."""
+    return f"{session['listener']}/{session['id']}"
+
+
 def _row(session: dict[str, Any]) -> tuple[str, ...]:
     return (
-        plain(f"{session['listener']}/{session['id']}"),
+        plain(_id(session)),
         plain(session["peer"]),
         log_lines.timestamp(session["opened"]),
         f"{session['idle']:.1f} s",
