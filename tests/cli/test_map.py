@@ -222,6 +222,14 @@ def test_progress_is_shown_on_a_terminal_and_the_picture_has_its_width(url: str)
     assert re.search(r"^discrete inputs +·{40}$", shown, re.M)
 
 
+def test_addresses_below_a_narrow_picture_are_apart(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "32")
+    shown = done("describe", "map", url, "--areas", "hr", "--range", "0-999")
+    assert ["0", "250", "750"] in [line.split() for line in shown]
+
+
 def test_what_was_found_is_shown_when_it_is_interrupted() -> None:
     reached, go_on = threading.Event(), threading.Event()
 

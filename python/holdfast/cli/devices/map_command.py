@@ -162,7 +162,8 @@ def _picture(survey: Survey) -> list[str]:
     scale = ""
     for quarter in range(4):
         at = cells * quarter // 4
-        scale = f"{scale:{at}}{_bounds(survey.span, cells, at)[0]}"
+        if not scale or len(scale) < at:
+            scale = f"{scale:{at}}{_bounds(survey.span, cells, at)[0]}"
     last = str(survey.span.stop - 1)
     scale = f"{scale:{cells - len(last)}}{last}" if len(scale) < cells - len(last) else scale
     return [*lines, " " * margin + scale]
