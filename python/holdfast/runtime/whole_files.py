@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,9 +15,11 @@ if TYPE_CHECKING:
 NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 """Flags for a new file; Windows would convert line ends without `O_BINARY`."""
 
+USUAL = 0o666
 SECRET = 0o600
 PUBLIC = 0o644
-"""The modes of files with keys, and of other files."""
+"""Modes of new files, of which the mask of the process takes some away: those of all programs, of
+files with keys, and of files that others must be able to read."""
 
 
 def write_new(contents: Mapping[Path, tuple[bytes, int]]) -> None:
@@ -45,30 +49,55 @@ def write_new(contents: Mapping[Path, tuple[bytes, int]]) -> None:
 def replace(file: Path, content: bytes, mode: int | None = None) -> None:
     """Writes a file that programs may read at the same time, and that a full disk leaves as it was.
 
-    Without `mode`, it keeps that of the file before. A pipe or a device is not replaced. Raises
-    `OSError`.
+    Without `mode`, a file keeps the one that it has. What can't be replaced is written in place: a
+    pipe, a device, a file of another owner, or one whose folder allows no others. Raises `OSError`.
     """
-    file = file.resolve()
     try:
-        before = file.stat().st_mode
+        before = file.stat()
     except FileNotFoundError:
-        before = stat.S_IFREG | PUBLIC
-    if not stat.S_ISREG(before):
-        file.write_bytes(content)
-        return
-    new = _written_beside(file, content, PUBLIC if mode is None else mode)
+        before = None
+    if before is None or stat.S_ISREG(before.st_mode):
+        try:
+            _replace(Path(os.path.realpath(file)), content, mode, before)
+            return
+        except OSError as error:
+            if before is None or error.errno not in _IRREPLACEABLE:
+                raise
+    file.write_bytes(content)
+
+
+_IRREPLACEABLE = (errno.EACCES, errno.EPERM, errno.EBUSY, errno.EROFS)
+"""Errors of a folder or an owner, or of a file that is mounted alone; the file may be writable."""
+
+
+def _replace(file: Path, content: bytes, mode: int | None, before: os.stat_result | None) -> None:
+    new = _written_beside(file, content, USUAL if mode is None else mode)
     try:
-        if mode is None:
-            new.chmod(stat.S_IMODE(before))
+        if before is not None:
+            _give(new, before)
+            if mode is None:
+                new.chmod(stat.S_IMODE(before.st_mode))
         new.replace(file)
     except BaseException:
         new.unlink(missing_ok=True)
         raise
 
 
+def _give(new: Path, before: os.stat_result) -> None:
+    """Gives a file the owner and group of the one that it replaces."""
+    if sys.platform != "win32":
+        made = new.stat()
+        if (made.st_uid, made.st_gid) != (before.st_uid, before.st_gid):
+            os.chown(new, before.st_uid, before.st_gid)
+
+
 def try_replace(file: Path) -> None:
-    """Raises `OSError` if the folder of a file does not allow `replace`. Changes nothing."""
-    _written_beside(file.resolve(), b"", PUBLIC).unlink()
+    """Raises `OSError` if a file can't be written by `replace`. Changes nothing."""
+    try:
+        _written_beside(Path(os.path.realpath(file)), b"", USUAL).unlink()
+    except OSError as error:
+        if error.errno not in _IRREPLACEABLE or not os.access(file, os.W_OK):
+            raise
 
 
 def _written_beside(file: Path, content: bytes, mode: int) -> Path:

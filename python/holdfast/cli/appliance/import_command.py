@@ -215,7 +215,7 @@ def _write(output: Path, text: str, force: bool) -> None:
         if force:
             whole_files.replace(output, text.encode())
         else:
-            whole_files.write_new({output: (text.encode(), whole_files.PUBLIC)})
+            whole_files.write_new({output: (text.encode(), whole_files.USUAL)})
     except FileExistsError:
         fail(f"{output}: already exists; --force overwrites it", reason="file", prefix="")
     except OSError as error:

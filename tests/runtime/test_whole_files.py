@@ -1,0 +1,72 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import pytest
+
+from holdfast.runtime import whole_files
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+
+@pytest.fixture
+def _private_files() -> Iterator[None]:
+    before = os.umask(0o077)
+    yield
+    os.umask(before)
+
+
+@pytest.mark.usefixtures("_private_files")
+def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_the_process(tmp_path: Path) -> None:
+    new, old = tmp_path / "new", tmp_path / "old"
+    old.write_bytes(b"1")
+    old.chmod(0o664)
+    for file in (new, old):
+        whole_files.replace(file, b"2")
+    assert (new.stat().st_mode & 0o777, old.stat().st_mode & 0o777) == (0o600, 0o664)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+def test_a_file_keeps_its_owner(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.write_bytes(b"1")
+    os.chown(file, 1234, 5678)
+    whole_files.replace(file, b"2")
+    assert (file.stat().st_uid, file.stat().st_gid, file.read_bytes()) == (1234, 5678, b"2")
+
+
+def test_the_file_behind_a_link_is_replaced(tmp_path: Path) -> None:
+    file, link = tmp_path / "file", tmp_path / "link"
+    file.write_bytes(b"1")
+    link.symlink_to(file)
+    whole_files.replace(link, b"2")
+    assert (link.is_symlink(), file.read_bytes()) == (True, b"2")
+
+
+def test_a_pipe_is_written_to(tmp_path: Path) -> None:
+    reading, writing = os.pipe()
+    whole_files.replace(tmp_path / f"/dev/fd/{writing}", b"2")
+    os.close(writing)
+    with os.fdopen(reading, "rb") as pipe:
+        assert pipe.read() == b"2"
+
+
+def test_a_file_in_a_folder_that_takes_no_other_is_written_in_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    file = tmp_path / "file"
+    file.write_bytes(b"1")
+    monkeypatch.setattr(whole_files, "write_new", refuse)
+    whole_files.try_replace(file)
+    whole_files.replace(file, b"2")
+    assert file.read_bytes() == b"2"
+    with pytest.raises(PermissionError):
+        whole_files.replace(tmp_path / "new", b"2")
