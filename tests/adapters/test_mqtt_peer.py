@@ -574,6 +574,18 @@ def test_a_connection_that_the_broker_ends_after_an_answer_is_logged_with_its_to
     assert str(running.status()["last_error"]).endswith(", soon after a reply to 'forbidden/me'")
 
 
+def test_another_reason_of_a_broker_has_nothing_of_an_answer(rig: Rig, fake5: FakeBroker) -> None:
+    running = run(rig, fake5)
+    with fake5.accept() as peer:
+        peer.welcome()
+        peer.send(ask(1, 0, "answers/me"))
+        while peer.receive().kind != mqtt.PUBLISH:
+            pass
+        peer.send(b"\xe0\x01\x8e")
+    wire.until(lambda: running.status()["last_error"] is not None, "it ended")
+    assert running.status()["last_error"] == "the broker ended the connection: Session taken over"
+
+
 def test_an_answer_comes_after_the_acknowledgement(rig: Rig, fake5: FakeBroker) -> None:
     run(rig, fake5)
     with fake5.accept() as peer:

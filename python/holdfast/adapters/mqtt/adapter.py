@@ -35,6 +35,12 @@ if TYPE_CHECKING:
     from holdfast.ingest import MemoryAccess
     from holdfast.runtime.stop import Stop
 
+ENDED = "the broker ended the connection"
+CLOSED = "the broker closed the connection"
+LOST = "the connection was lost"
+_MAY_FOLLOW_A_REPLY = (CLOSED, LOST, f"{ENDED}: Not authorized")
+"""Ends that a reply on a topic which the broker forbids can have."""
+
 LOG_INTERVAL_S = 600.0
 """Seconds before a failure to connect with the same reason is logged again."""
 
@@ -161,12 +167,13 @@ class Mqtt:
     def _ended(self, link: BrokerConnection | None) -> float:
         """Logs the end of a connection or attempt. Returns the seconds that it was connected."""
         began, self._connected_at = self._connected_at, None
-        reason = self._ending or "the broker closed the connection"
+        reason = self._ending or CLOSED
         self._subscriptions.ended()
         if reason != "stopped":
             if began is not None and link is not None:
+                topic = link.topic_answered_just_now if reason in _MAY_FOLLOW_A_REPLY else None
                 reason = self._client_id.explained(reason, link)
-                if link.trouble is None and (topic := link.topic_answered_just_now) is not None:
+                if topic is not None:
                     reason += f", soon after a reply to {quote(topic)}"
             self._last_error = reason
         if began is not None:
@@ -224,9 +231,9 @@ class Mqtt:
         if self._ending is not None:
             return
         if flags.is_disconnect_packet_from_server:
-            self._ending = f"the broker ended the connection: {reason}"
+            self._ending = f"{ENDED}: {reason}"
         elif reason.getName() == "Unspecified error":
-            self._ending = "the connection was lost"
+            self._ending = LOST
         else:
             self._ending = str(reason)
 
