@@ -935,7 +935,7 @@ class Request:
         """Function 23."""
 
     @staticmethod
-    def diagnostics(sub_function: int, data: bytes) -> Request:
+    def diagnostics(sub_function: int, data: Iterable[int]) -> Request:
         """Function 8."""
 
     @staticmethod
@@ -1678,8 +1678,8 @@ def check_log_name(name: str) -> None:
 def check_log_node(name: str) -> None:
     """Raises `ValueError`, which says what is allowed, if a node of a log can't have this name."""
 
-def pack_raw_ingest(area: Area, values: list[int]) -> bytes:
-    """The payload of a Raw Ingest packet.
+def pack_raw_ingest(area: Area, values: Iterable[int]) -> tuple[bytes, int]:
+    """The payload of a Raw Ingest packet, and its number of values.
 
     Raises `ValueError` for a value out of range or an unknown area, `TypeError` for a value of
     another type.

@@ -122,7 +122,7 @@ def test_small_integers_do_not_wrap(plc: holdfast.SyncClient) -> None:
 def test_diagnostics_take_them(plc: holdfast.SyncClient) -> None:
     with pytest.raises(holdfast.ModbusException):
         plc.diagnostics(numpy.uint16(0), [numpy.uint16(5)])
-    with pytest.raises(ValueError, match="data contains"):
+    with pytest.raises(TypeError, match=r"data\[0\] is"):
         plc.diagnostics(0, [FLOAT])
 
 

@@ -68,6 +68,7 @@ def test_a_batch_returns_how_many_values_it_wrote() -> None:
         ("coils", 0, "11", None, "invalid_type"),
         ("coils", 0, b"\1", None, "invalid_type"),
         ("coils", 0, 1, None, "invalid_type"),
+        ("coils", 0, {1: 0}, None, "invalid_type"),
     ],
 )
 def test_a_refusal_says_which_write_which_value_and_why(

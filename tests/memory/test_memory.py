@@ -7,8 +7,10 @@ import random
 import re
 import sys
 import threading
+from collections import UserDict, UserList
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import pytest
@@ -32,6 +34,21 @@ REGISTER_AREAS: tuple[Area, ...] = ("holding_registers", "input_registers")
 each_area = pytest.mark.parametrize("area", AREAS)
 each_bit_area = pytest.mark.parametrize("area", BIT_AREAS)
 each_register_area = pytest.mark.parametrize("area", REGISTER_AREAS)
+
+
+class Table(UserList[int]):
+    """As a `DataFrame` of pandas: it has rows, and yields the names of its columns."""
+
+    ndim = 2
+
+
+class Column(UserList[int]):
+    """As a `Series` of pandas: it has keys, and yields its values."""
+
+    ndim = 1
+
+    def keys(self) -> list[str]:
+        return ["a", "b"]
 
 
 def of_one_area(area: Area, start: int, size: int) -> holdfast.Memory:
@@ -257,6 +274,9 @@ def test_a_bool_is_no_register(area: Area, memory: holdfast.Memory) -> None:
         1,
         None,
         {1: 0},
+        MappingProxyType({1: 0}),
+        UserDict({1: 0}),
+        Table([0]),
         {1, 0},
         frozenset({1}),
     ],
@@ -267,6 +287,11 @@ def test_values_that_are_no_sequence_of_numbers_are_a_type_error(
     with pytest.raises(TypeError):
         memory.write(area, 0, values)
     assert memory.read(area, 0, 8) == [0] * 8
+
+
+def test_a_column_with_keys_is_its_values(memory: holdfast.Memory) -> None:
+    memory.write("holding_registers", 0, Column([7, 8]))
+    assert memory.read("holding_registers", 0, 2) == [7, 8]
 
 
 @each_register_area

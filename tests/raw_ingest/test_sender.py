@@ -233,6 +233,7 @@ WRONG: list[tuple[str, dict[str, Any], type[Exception], str]] = [
     ("a bit", {"area": "coils", "values": [2]}, ValueError, "values[0] is 2, allowed: 0, 1, F"),
     ("a bit of 1.0", {"area": "coils", "values": [1.0]}, TypeError, "values[0] is 1.0, allowed"),
     ("bytes as values", {"values": b"\0\1"}, TypeError, "values are bytes; pass them as data"),
+    ("a mapping", {"values": {0: 5}}, TypeError, "values are dict, not a sequence of integers"),
     ("nothing at all", {"values": None}, TypeError, "a packet requires either values or data"),
     ("values and data", {"data": b"\0\1"}, TypeError, "a packet requires either values or data"),
     ("another count", {"count": 2}, ValueError, "count is 2, but found 3 values"),

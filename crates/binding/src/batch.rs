@@ -12,7 +12,7 @@ use pyo3::types::{PyBytes, PyList, PyString, PyTuple};
 use crate::audit_fields;
 use crate::batch_refusal::{refusal, refused};
 use crate::ended_writes::Waiting;
-use crate::memory::{Memory, Unfit, integer, is_text, item, put};
+use crate::memory::{Memory, Unfit, integer, is_sequence, item, put};
 
 /// A write with a valid range. Its values are not checked yet.
 struct Pending<'py> {
@@ -206,9 +206,9 @@ fn parts<'py>(write: &Bound<'py, PyAny>) -> PyResult<(Place<'py>, Bound<'py, PyA
     Ok(((memory, area, address), values, false))
 }
 
-/// Lists the items of an iterable. `None` if it is not iterable, or is text or bytes.
+/// Lists the items of an iterable. `None` if it is no sequence of values.
 fn listed<'py>(values: &Bound<'py, PyAny>) -> PyResult<Option<Bound<'py, PyList>>> {
-    if is_text(values) {
+    if !is_sequence(values) {
         return Ok(None);
     }
     let Ok(items) = values.try_iter() else { return Ok(None) };

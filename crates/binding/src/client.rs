@@ -24,7 +24,7 @@ use pyo3::types::{PyBytes, PyList};
 use pyo3::{PyTraverseError, PyVisit};
 
 use crate::arguments::{byte, os_text, seconds, unknown, within, word};
-use crate::memory::{Integer, integer, numbers};
+use crate::memory::{Integer, integer, item, numbers};
 
 pyo3::import_exception!(holdfast.errors, ModbusException);
 pyo3::import_exception!(holdfast.errors, ConnectFailed);
@@ -68,7 +68,7 @@ impl Request {
 
     #[staticmethod]
     fn write_coils(address: Integer, values: &Bound<'_, PyAny>) -> PyResult<Request> {
-        let values = numbers(Area::Coils, values)?;
+        let values = numbers("values", Area::Coils, values)?;
         let range = range::<{ limit::WRITE_BITS }>(address, Integer(values.len() as i128))?;
         let values: Vec<bool> = values.iter().map(|bit| *bit == 1).collect();
         let mut room = [0; pdu::MAX_LEN];
@@ -78,7 +78,7 @@ impl Request {
 
     #[staticmethod]
     fn write_registers(address: Integer, values: &Bound<'_, PyAny>) -> PyResult<Request> {
-        let values = numbers(Area::HoldingRegisters, values)?;
+        let values = numbers("values", Area::HoldingRegisters, values)?;
         let range = range::<{ limit::WRITE_REGISTERS }>(address, Integer(values.len() as i128))?;
         let mut room = [0; pdu::MAX_LEN];
         let registers = Registers::pack(&values, &mut room).map_err(refused)?;
@@ -101,7 +101,7 @@ impl Request {
         write_address: Integer,
         values: &Bound<'_, PyAny>,
     ) -> PyResult<Request> {
-        let values = numbers(Area::HoldingRegisters, values)?;
+        let values = numbers("values", Area::HoldingRegisters, values)?;
         let read = range(read_address, count)?;
         let written = Integer(values.len() as i128);
         let write_address =
@@ -112,14 +112,16 @@ impl Request {
     }
 
     #[staticmethod]
-    fn diagnostics(sub_function: Integer, data: &[u8]) -> PyResult<Request> {
+    fn diagnostics(sub_function: Integer, data: &Bound<'_, PyAny>) -> PyResult<Request> {
+        let words = numbers("data", Area::HoldingRegisters, data)?;
+        let data: Vec<u8> = words.iter().flat_map(|word| word.to_be_bytes()).collect();
         let known = u16::try_from(sub_function.0).ok().and_then(SubFunction::from_code);
         let sub_function = known.ok_or_else(|| {
             let allowed = SubFunction::ALL.iter().map(|each| each.code().to_string());
             let allowed = allowed.collect::<Vec<_>>().join(", ");
             PyValueError::new_err(format!("sub_function is {}, allowed: {allowed}", sub_function.0))
         })?;
-        let asked = Diagnostics::new(sub_function, data).map_err(refused)?;
+        let asked = Diagnostics::new(sub_function, &data).map_err(refused)?;
         Ok(encoded(&CoreRequest::Diagnostics(asked)))
     }
 
@@ -147,7 +149,7 @@ impl Request {
     #[staticmethod]
     fn write_files(ranges: Vec<(Integer, Integer, Bound<'_, PyAny>)>) -> PyResult<Request> {
         let ranges = ranges.into_iter().map(|(file, record, values)| {
-            let values = numbers(Area::HoldingRegisters, &values)?;
+            let values = numbers("values", Area::HoldingRegisters, &values)?;
             let count = Integer(values.len() as i128);
             let range = file_range(file, record, count, limit::WRITE_RECORDS)?;
             Ok((range.file(), range.record(), values))
@@ -633,6 +635,5 @@ fn register(what: &str, Integer(number): Integer) -> PyResult<u16> {
 
 /// Extracts and checks the value of one bit or register.
 fn single(area: Area, value: &Bound<'_, PyAny>) -> PyResult<u16> {
-    let values = PyList::new(value.py(), [value])?;
-    Ok(numbers(area, values.as_any())?[0])
+    item(area, value).or_else(|unfit| Err(unfit.error(area, "value", value)?))
 }

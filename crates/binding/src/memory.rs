@@ -11,7 +11,8 @@ use holdfast_protocol::pdu::limit;
 use pyo3::exceptions::{PyIndexError, PyOSError, PyOverflowError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{
-    PyBool, PyByteArray, PyBytes, PyDict, PyFrozenSet, PyInt, PyList, PyMemoryView, PySet, PyString,
+    PyBool, PyByteArray, PyBytes, PyDict, PyFrozenSet, PyInt, PyList, PyMapping, PyMemoryView,
+    PySet, PyString,
 };
 
 use crate::arguments::{within, word};
@@ -306,7 +307,7 @@ impl Range {
         address: i128,
         values: &Bound<'_, PyAny>,
     ) -> PyResult<Range> {
-        let items = numbers(area_or_file(area)?, values)?;
+        let items = numbers("values", area_or_file(area)?, values)?;
         let mut range =
             Range::new(memory, area, address, items.len() as i128).map_err(|error| {
                 if items.is_empty() { PyValueError::new_err("values are empty") } else { error }
@@ -434,31 +435,40 @@ pub fn put(area: Area, bytes: &mut [u8], index: usize, item: u16) {
     }
 }
 
-/// Extracts and checks the integers of a Python iterable.
-pub fn numbers<'py>(area: Area, values: &Bound<'py, PyAny>) -> PyResult<Vec<u16>> {
-    let shown = |value: &Bound<'py, PyAny>| value.repr().map(Bound::into_any);
+/// Extracts and checks the integers of a Python iterable, which errors name.
+pub fn numbers<'py>(name: &str, area: Area, values: &Bound<'py, PyAny>) -> PyResult<Vec<u16>> {
+    let number = |(index, value): (usize, Bound<'py, PyAny>)| {
+        item(area, &value)
+            .or_else(|unfit| Err(unfit.error(area, &format!("{name}[{index}]"), &value)?))
+    };
     if let Ok(list) = values.cast_exact::<PyList>() {
-        let items = list.iter().enumerate();
-        return items.map(|(index, value)| number(area, index, &value, shown)).collect();
+        return list.iter().enumerate().map(number).collect();
     }
-    if is_text(values) || is_unordered(values) || (!area.is_bits() && is_view_of_bytes(values)) {
+    if !is_sequence(values) || (!area.is_bits() && is_view_of_bytes(values)) {
         let found = values.get_type().name()?;
-        return Err(PyTypeError::new_err(format!(
-            "values are {found}, not a sequence of integers"
-        )));
+        let message = format!("{name} are {found}, not a sequence of integers");
+        return Err(PyTypeError::new_err(message));
     }
     let mut numbers = Vec::with_capacity(values.len().unwrap_or(0).min(Span::MAX_SIZE as usize));
     for (index, value) in values.try_iter()?.enumerate() {
-        numbers.push(number(area, index, &value?, shown)?);
+        numbers.push(number((index, value?))?);
     }
     Ok(numbers)
 }
 
-/// Whether this is text or bytes. Both are iterable, but are not accepted as values.
-pub fn is_text(values: &Bound<'_, PyAny>) -> bool {
-    values.is_instance_of::<PyString>()
+/// Whether what an iterable yields are values, in an order.
+///
+/// Text and bytes yield characters, a mapping its keys, a set no order, and what has rows and columns,
+/// such as a `DataFrame` of pandas, the names of its columns.
+pub fn is_sequence(values: &Bound<'_, PyAny>) -> bool {
+    let is_text = values.is_instance_of::<PyString>()
         || values.is_instance_of::<PyBytes>()
-        || values.is_instance_of::<PyByteArray>()
+        || values.is_instance_of::<PyByteArray>();
+    let is_unordered = values.is_instance_of::<PySet>()
+        || values.is_instance_of::<PyFrozenSet>()
+        || values.cast::<PyMapping>().is_ok();
+    let dimensions = values.getattr("ndim").and_then(|dimensions| dimensions.extract::<usize>());
+    !is_text && !is_unordered && dimensions.unwrap_or(1) == 1
 }
 
 /// Whether this is a view of bytes: each would become a register. As bits, its items may be 0 and 1.
@@ -469,19 +479,25 @@ fn is_view_of_bytes(values: &Bound<'_, PyAny>) -> bool {
     format.is_some_and(|format| matches!(format.trim_start_matches('<'), "B" | "c"))
 }
 
-/// Whether this is a mapping, whose keys would be its values, or a set.
-fn is_unordered(values: &Bound<'_, PyAny>) -> bool {
-    values.is_instance_of::<PyDict>()
-        || values.is_instance_of::<PySet>()
-        || values.is_instance_of::<PyFrozenSet>()
-}
-
 /// Why an object is not a value of an area.
 pub enum Unfit {
     /// The integer is too small or too large.
     Value,
     /// The object is not an integer, or is a boolean for a register.
     Type,
+}
+
+impl Unfit {
+    /// The error for a value of an area.
+    pub fn error(self, area: Area, name: &str, value: &Bound<'_, PyAny>) -> PyResult<PyErr> {
+        let allowed = if area.is_bits() { "0, 1, False, True" } else { "integers 0 to 65535" };
+        let shown = value.py().import("reprlib")?.call_method1("repr", (value,))?;
+        let message = format!("{name} is {shown}, allowed: {allowed}");
+        Ok(match self {
+            Unfit::Value => PyValueError::new_err(message),
+            Unfit::Type => PyTypeError::new_err(message),
+        })
+    }
 }
 
 /// The largest value of an area.
@@ -513,21 +529,4 @@ fn is_numpy_bool(value: &Bound<'_, PyAny>) -> bool {
         name.is_ok_and(|name| allowed.iter().any(|allowed| name == *allowed))
     };
     is(kind.name(), &["bool", "bool_"]) && is(kind.module(), &["numpy"])
-}
-
-/// Extracts and checks one value of many. Its error shows the value as `shown` does.
-pub fn number<'py>(
-    area: Area,
-    index: usize,
-    value: &Bound<'py, PyAny>,
-    shown: impl Fn(&Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>>,
-) -> PyResult<u16> {
-    item(area, value).or_else(|unfit| {
-        let allowed = if area.is_bits() { "0, 1, False, True" } else { "integers 0 to 65535" };
-        let message = format!("values[{index}] is {}, allowed: {allowed}", shown(value)?);
-        Err(match unfit {
-            Unfit::Value => PyValueError::new_err(message),
-            Unfit::Type => PyTypeError::new_err(message),
-        })
-    })
 }

@@ -6,29 +6,26 @@ use holdfast_engine::raw_ingest_areas::in_packet;
 use holdfast_protocol::raw_ingest::Header;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use pyo3::types::{PyBytes, PyList};
+use pyo3::types::PyBytes;
 
 use crate::arguments::packet_format;
-use crate::memory::{named, number, put};
+use crate::memory::{named, numbers, put};
 
-/// Packs bits or registers into a payload. Values must be integers; booleans are allowed for bits
-/// only.
+/// Packs bits or registers into a payload. Returns it with their number. Values must be integers;
+/// booleans are allowed for bits only.
 #[pyfunction]
 pub fn pack_raw_ingest<'py>(
     py: Python<'py>,
     area: &str,
-    values: &Bound<'py, PyList>,
-) -> PyResult<Bound<'py, PyBytes>> {
+    values: &Bound<'py, PyAny>,
+) -> PyResult<(Bound<'py, PyBytes>, usize)> {
     let area = named(area)?;
-    let count = values.len();
-    let mut payload = vec![0; area.byte_len(count)];
-    // The list may grow meanwhile.
-    for (index, value) in values.iter().enumerate().take(count) {
-        let short =
-            |value: &Bound<'py, PyAny>| py.import("reprlib")?.call_method1("repr", (value,));
-        put(area, &mut payload, index, number(area, index, &value, short)?);
+    let items = numbers("values", area, values)?;
+    let mut payload = vec![0; area.byte_len(items.len())];
+    for (index, item) in items.iter().enumerate() {
+        put(area, &mut payload, index, *item);
     }
-    Ok(PyBytes::new(py, &payload))
+    Ok((PyBytes::new(py, &payload), items.len()))
 }
 
 /// Encodes one packet. `target` is a unit id (v1) or a memory id (crc).

@@ -29,7 +29,6 @@ from holdfast.runtime.text import listing
 from holdfast.types import AREAS, BIT_AREAS, SHORT_AREAS, WRITABLE_AREAS
 from holdfast.values.codec import codec_for
 from holdfast.values.errors import UnknownType
-from holdfast.values.integers import as_integer
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -271,13 +270,7 @@ def _check_area(area: Area, allowed: Sequence[Area]) -> None:
 
 def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
     """Sends and receives data words (function 8)."""
-    sent = b""
-    for word in data:
-        number = as_integer(word)
-        if number is None or not 0 <= number <= MAX_WORD:
-            raise ValueError(f"data contains {word!r}, allowed: words 0 to {MAX_WORD}")
-        sent += number.to_bytes(2, "big")
-    reply: bytes = yield Request.diagnostics(sub_function, sent)
+    reply: bytes = yield Request.diagnostics(sub_function, data)
     return [int.from_bytes(reply[at : at + 2], "big") for at in range(0, len(reply), 2)]
 
 

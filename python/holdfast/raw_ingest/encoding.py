@@ -96,12 +96,12 @@ def _payload(
     if isinstance(values, Data):
         raise TypeError("values are bytes; pass them as data")
     assert values is not None
-    items = list(values)
-    if not 1 <= len(items) <= MAX_FIELD:
-        raise ValueError(f"found {len(items)} values, allowed: 1 to {MAX_FIELD}")
-    if count not in (None, len(items)):
-        raise ValueError(f"count is {count}, but found {len(items)} values")
-    return pack_raw_ingest(area, items), len(items)
+    payload, items = pack_raw_ingest(area, values)
+    if not 1 <= items <= MAX_FIELD:
+        raise ValueError(f"found {items} values, allowed: 1 to {MAX_FIELD}")
+    if count not in (None, items):
+        raise ValueError(f"count is {count}, but found {items} values")
+    return payload, items
 
 
 def _checked(area: Area, data: Data, count: int | None) -> tuple[bytes, int]:
