@@ -18,14 +18,25 @@ from support.machine import has_ipv6
 needs_ipv6 = pytest.mark.skipif(not has_ipv6(), reason="needs IPv6")
 
 FORKS = """
-import os, sys
+import os, sys, threading
 import holdfast
 
 memory = holdfast.Memory(holding_registers=10)
 server = holdfast.Server({1: memory}, bind="127.0.0.1:0", access="read-write").start()
+poller = holdfast.Poller()
+# Their memory is used again by threads of the child.
+for _ in range(6):
+    threading.Thread(target=threading.Event().wait, daemon=True).start()
 child = os.fork()
 if child == 0:
+    together = threading.Barrier(8)
+    threads = [threading.Thread(target=together.wait) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
     server.stop()
+    del server, poller
     sys.exit(7)
 assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
 print(*server.address, flush=True)

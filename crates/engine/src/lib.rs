@@ -22,7 +22,6 @@ pub mod http;
 pub mod items;
 pub mod link;
 mod name_lookup;
-mod own_threads;
 pub mod poller;
 pub mod raw_ingest_areas;
 mod serial_line;

@@ -1,4 +1,5 @@
-//! What everything that runs for long shares: the pauses after failures, counters, locks, and a clock.
+//! What everything that runs for long shares: the pauses after failures, counters, locks, threads that a value
+//! owns, and a clock.
 
 #![forbid(unsafe_code)]
 
@@ -6,8 +7,10 @@ mod backoff;
 mod clock;
 mod counter;
 mod lock;
+mod own_threads;
 
 pub use backoff::Retry;
 pub use clock::{Epoch, time_since_boot};
 pub use counter::Counter;
 pub use lock::lock;
+pub use own_threads::OwnThreads;

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
-use holdfast_runtime::lock;
+use holdfast_runtime::{OwnThreads, lock};
 use tokio::runtime::Builder;
 use tokio::sync::watch;
 use tokio::time::sleep;
@@ -16,7 +16,6 @@ use super::exchange::Event;
 use super::front::{Front, HttpSettings};
 use super::inbox::Inbox;
 use crate::heartbeat::Heartbeat;
-use crate::own_threads::OwnThreads;
 use crate::server::Peer;
 use crate::server::connections::listener::{Admitted, ListenerContext, Service, Serving, accept};
 use crate::server::connections::reloadable::Reloadable;

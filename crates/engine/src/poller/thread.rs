@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use holdfast_memory::Memory;
 use holdfast_protocol::pdu::EncodedRequest;
-use holdfast_runtime::{lock, time_since_boot};
+use holdfast_runtime::{OwnThreads, lock, time_since_boot};
 use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{LocalSet, spawn_local};
@@ -33,7 +33,6 @@ use super::write_through::{Passage, PassedRange, PassedWrite};
 use crate::client::Endpoint;
 use crate::heartbeat::Heartbeat;
 use crate::link::{Call, Fault, Fence, LinkSettings, SharedLink, serve, standstill};
-use crate::own_threads::OwnThreads;
 
 /// A running poller, until it is stopped or dropped. Devices can be added and removed.
 pub struct Poller {

@@ -9,7 +9,7 @@ use std::thread;
 use std::time::Duration;
 
 use holdfast_protocol::pdu::identification::ObjectError;
-use holdfast_runtime::lock;
+use holdfast_runtime::{OwnThreads, lock};
 use thiserror::Error;
 use tokio::runtime::{Builder, Handle, Runtime};
 use tokio::sync::watch;
@@ -18,7 +18,6 @@ use tokio::task::AbortHandle;
 pub use self::listening_sockets::SocketKind;
 use self::listening_sockets::{ListeningSocket, tcp, udp as udp_socket};
 use crate::heartbeat::Heartbeat;
-use crate::own_threads::OwnThreads;
 use crate::serial_line::SerialLine;
 use crate::server::connections::admission::{ConnectionLimits, OpenConnection};
 use crate::server::connections::listener::{ListenerContext, Service, accept};

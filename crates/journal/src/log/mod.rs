@@ -35,11 +35,10 @@ mod stream;
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
-use std::thread::JoinHandle;
 use std::time::Duration;
 
 use holdfast_memory::{Journal, Memory};
-use holdfast_runtime::lock;
+use holdfast_runtime::{OwnThreads, lock};
 
 pub use defaults::{MAX_LAG, WRITE_TIMEOUT};
 pub use error::LogError;
@@ -59,8 +58,7 @@ pub struct Log {
     settings: Arc<Settings>,
     members: Vec<(String, Arc<Memory>)>,
     shared: Arc<Shared>,
-    process: u32,
-    thread: Mutex<Option<JoinHandle<()>>>,
+    thread: OwnThreads,
     /// What the contents come from that the memories have before the start.
     note: Mutex<Option<Note>>,
 }
@@ -87,8 +85,8 @@ impl Log {
             let journal: Arc<dyn Journal> = Arc::clone(&shared) as _;
             memory.keep_in(journal, member as u16);
         }
-        let (process, thread, note) = (std::process::id(), Mutex::default(), Mutex::default());
-        Ok(Log { settings, members, shared, process, thread, note })
+        let (thread, note) = (OwnThreads::default(), Mutex::default());
+        Ok(Log { settings, members, shared, thread, note })
     }
 
     /// Begins with the contents that the memories have now, with the note that came with them. A log that
@@ -119,21 +117,21 @@ impl Log {
     /// # Errors
     /// [`LogError::Thread`], and [`LogError::Snapshot`] for contents that are not those of the note.
     pub fn start(&self) -> Result<(), LogError> {
-        let mut thread = lock(&self.thread);
-        if thread.is_some() {
+        let mut note = lock(&self.note);
+        if self.thread.are_running() {
             return Ok(());
         }
         let members = self.members.iter().map(|(_, memory)| Arc::clone(memory)).collect();
         let fingerprint = layout::fingerprint(&self.members);
         let (settings, shared) = (Arc::clone(&self.settings), Arc::clone(&self.shared));
         let mut node = Running::new(settings, fingerprint, shared, members);
-        if let Some(note) = lock(&self.note).take() {
+        if let Some(note) = note.take() {
             node.applier.resume(note)?;
         }
         let name = format!("log {}", self.settings.name);
         let started =
             std::thread::Builder::new().name(name).spawn(move || parts::thread::run(node));
-        *thread = Some(started.map_err(|error| LogError::Thread(error.to_string()))?);
+        self.thread.push(started.map_err(|error| LogError::Thread(error.to_string()))?);
         Ok(())
     }
 
@@ -172,15 +170,11 @@ impl Log {
 
     /// Refuses writes from now on, waits for those that were sent, and ends the thread.
     pub fn stop(&self) {
-        if self.process != std::process::id() {
+        if self.thread.are_of_another_process() {
             return;
         }
         self.shared.stop();
-        let mut thread = lock(&self.thread);
-        if let Some(thread) = thread.take() {
-            let ended = thread.join();
-            debug_assert!(ended.is_ok() || std::thread::panicking(), "the thread panicked");
-        }
+        self.thread.join();
     }
 
     pub fn status(&self) -> Status {
