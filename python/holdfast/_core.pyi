@@ -1563,6 +1563,9 @@ class PollReceiver:
     def wake(self) -> None:
         """Ends the current or the next wait of `take`."""
 
+    def withdraw(self) -> None:
+        """Gives up its writes: those that were not sent yet are not sent."""
+
     @property
     def dropped(self) -> int:
         """Polls that are missing because the queue was full; the oldest are dropped."""

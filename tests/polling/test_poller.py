@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import _thread
 import asyncio
 import itertools
+import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -442,6 +445,34 @@ def test_a_write_that_a_close_has_interrupted_may_have_been_carried_out(poller: 
     assert [asked.pdu[0] for asked in server.requests] == [3, 6]
     with pytest.raises(RuntimeError):
         poller.write("oven", "x", 1)
+
+
+def test_a_write_that_a_signal_interrupts_is_not_sent_later(poller: Poller) -> None:
+    interrupted, main = threading.Event(), threading.get_ident()
+
+    def hold(asked: Asked) -> None:
+        interrupted.wait(wire.DEADLINE)
+        asked.answer()
+
+    def is_waiting() -> bool:
+        frame = sys._current_frames()[main]
+        return frame.f_code is Poller.write.__code__ and "number" in frame.f_locals
+
+    def interrupt() -> None:
+        wire.until(is_waiting, "the write waits")
+        _thread.interrupt_main()
+
+    with Stream("tcp", hold) as server, ThreadPoolExecutor(1) as other:
+        reads = {"x": ("holding_registers", 5)}
+        poller.add(server.url, reads, name="oven", interval=0.05, timeout=wire.DEADLINE)
+        server.await_requests(1)
+        interrupting = other.submit(interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            poller.write("oven", "x", 1)
+        interrupted.set()
+        interrupting.result()
+        wire.until(lambda: len(server.requests) >= 3, "it is polled again")
+    assert {asked.pdu[0] for asked in server.requests} == {3}
 
 
 def test_a_scale_in_a_register_is_that_of_the_same_poll(

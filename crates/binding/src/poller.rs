@@ -275,6 +275,10 @@ impl PollReceiver {
         self.core.wake();
     }
 
+    fn withdraw(&self) {
+        self.core.withdraw();
+    }
+
     #[getter]
     fn dropped(&self) -> u64 {
         self.core.dropped()

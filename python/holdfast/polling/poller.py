@@ -198,7 +198,8 @@ class Poller:
 
         Returns when the device has confirmed it. Raises `KeyError` for an unknown device or tag,
         `ValueError` for a tag that is not `writable` or a value that does not fit, `WriteFailed`,
-        also for a `remove` or `close` meanwhile, and `RuntimeError` after `close`.
+        also for a `remove` or `close` meanwhile, and `RuntimeError` after `close`. An exception of
+        a signal handler, as that of Ctrl-C, ends the wait: what was not sent yet is not sent.
         """
         self._check_process()
         core_name = self._core_names[name]
@@ -212,16 +213,19 @@ class Poller:
             of.area, of.address, raw, of.type, of.order, of.encoding, split=False
         )
         writing = self._poller.new_receiver()
-        number = self._poller.write(core_name, request, writing)
-        while True:
-            results = writing.take(SIGNAL_CHECK_S)
-            if results is None:  # The poller was closed meanwhile.
-                raise WriteFailed(name, tag, LOST)
-            for done, fault in results[1]:
-                if done == number and fault:
-                    raise WriteFailed(name, tag, fault)
-                if done == number:
-                    return
+        try:
+            number = self._poller.write(core_name, request, writing)
+            while True:
+                results = writing.take(SIGNAL_CHECK_S)
+                if results is None:  # The poller was closed meanwhile.
+                    raise WriteFailed(name, tag, LOST)
+                for done, fault in results[1]:
+                    if done == number and fault:
+                        raise WriteFailed(name, tag, fault)
+                    if done == number:
+                        return
+        finally:  # A signal handler may end it here.
+            writing.withdraw()
 
     def counters(self) -> dict[str, dict[str, Any]]:
         """Health and counters of each device, by name."""

@@ -5,7 +5,7 @@
 //! full, the oldest polls are dropped and counted. Results of writes are never dropped.
 
 use std::collections::VecDeque;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError, Weak};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -73,6 +73,7 @@ pub struct Results {
     queue: Mutex<Batch>,
     ready: Condvar,
     dropped: AtomicU64,
+    has_withdrawn: AtomicBool,
 }
 
 impl Results {
@@ -82,6 +83,7 @@ impl Results {
             queue: Mutex::default(),
             ready: Condvar::default(),
             dropped: AtomicU64::default(),
+            has_withdrawn: AtomicBool::default(),
         }
     }
 
@@ -127,6 +129,15 @@ impl Results {
         batch.woken = true;
         drop(batch);
         self.ready.notify_one();
+    }
+
+    /// Gives up all writes whose results come here: those that were not sent yet are not sent.
+    pub fn withdraw(&self) {
+        self.has_withdrawn.store(true, Ordering::Relaxed);
+    }
+
+    pub(super) fn has_withdrawn(&self) -> bool {
+        self.has_withdrawn.load(Ordering::Relaxed)
     }
 
     /// Takes all results that wait. If there are none, waits up to `timeout` for the first.

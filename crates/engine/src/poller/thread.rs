@@ -263,8 +263,8 @@ impl Poller {
     }
 
     /// Sends a write over the connection of a device. Returns a number, under which its result is
-    /// passed `to` a receiver. What can't be sent until a time, and one timeout of the device, or waits
-    /// through a standstill, fails with [`Fault::Expired`].
+    /// passed `to` a receiver. What can't be sent until a time, and one timeout of the device, waits through a
+    /// standstill, or is withdrawn by the receiver, fails with [`Fault::Expired`].
     ///
     /// # Errors
     /// [`PollerError`] if there is no such device, or the request is not a write.

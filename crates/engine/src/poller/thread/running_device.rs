@@ -126,8 +126,8 @@ impl RunningDevice {
         Permit { fence: self.fence.clone(), until, wanted: Some(wanted) }
     }
 
-    /// Sends a write between two reads, as soon as possible. One that was sent has its result, even if the
-    /// device is removed.
+    /// Sends a write between two reads, as soon as possible, unless its receiver withdraws it before. One that
+    /// was sent has its result, even if the device is removed.
     pub(super) fn write(
         &self,
         ticket: u64,
@@ -142,11 +142,10 @@ impl RunningDevice {
         // Set once, by the thread of the link or by the end of the device.
         let is_sent = Arc::new(OnceLock::new());
         let mut device = self.writes.subscribe();
-        let sent = Arc::clone(&is_sent);
+        let (sent, receiver) = (Arc::clone(&is_sent), Arc::clone(&to));
         let permit = self.permit(until).and(standstill::none_since(queued));
-        let permit = permit.and(Arc::new(move |is_sent| match is_sent {
-            true => *sent.get_or_init(|| true),
-            false => true,
+        let permit = permit.and(Arc::new(move |is_sent| {
+            !receiver.has_withdrawn() && (!is_sent || *sent.get_or_init(|| true))
         }));
         let withdrawn = async move {
             let _ends = device.changed().await;
