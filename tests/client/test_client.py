@@ -32,6 +32,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import holdfast
+from holdfast import adapters, importing, polling, raw_ingest, values
 from holdfast._core import BlockingClient, Request
 from holdfast.client import async_transports, tcp_connect
 from holdfast.client import endpoint as endpoints
@@ -41,7 +42,6 @@ from holdfast.client.tolerance import Tolerance
 from holdfast.client.url import NetworkTarget, Tls, parse
 from holdfast.config.text.problems import Problem
 from holdfast.net import event_loop
-from holdfast.polling import WriteFailed
 from holdfast.server import Identity
 from holdfast.simulation.device import Refused
 from holdfast.types import AREAS
@@ -942,23 +942,38 @@ def test_no_error_of_a_later_request_says_that_nothing_was_written(
     assert str(error) == f"{before}; the first 123 of 200 registers are written"
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        holdfast.ModbusException(2, "illegal data address"),
-        holdfast.ConnectionLost("closed"),
-        of_a_later_request(holdfast.TlsFailed("expired", "tls://plc", "expired")),
-        holdfast.ConnectFailed("tcp://plc", "Connection refused", errno.ECONNREFUSED),
-        WriteFailed("meter", "power", 3),
-        TooManyValues(200, 123),
-        Refused("power", "power: too large"),
-        holdfast.TagError("scale", "scale is 0"),
-        holdfast.ConfigError(
-            "b.yaml", [Problem(file, 1, 2, "a", "bad") for file in ("a", "b.yaml")]
-        ),
-    ],
-    ids=lambda error: type(error).__name__,
-)
+PUBLIC_ERRORS = [
+    error
+    for module in (holdfast, adapters, importing, polling, raw_ingest, values)
+    for error in (getattr(module, name) for name in module.__all__)
+    if isinstance(error, type) and issubclass(error, Exception)
+]
+PROBLEMS = [Problem(file, 1, 2, "a", "bad") for file in ("a", "b.yaml")]
+ERRORS = [
+    holdfast.ModbusException(2, "illegal data address"),
+    holdfast.ConnectionLost("closed"),
+    of_a_later_request(holdfast.TlsFailed("expired", "tls://plc", "expired")),
+    holdfast.ConnectFailed("tcp://plc", "Connection refused", errno.ECONNREFUSED),
+    holdfast.RequestTimeout("no reply", maybe_sent=False),
+    holdfast.InvalidResponse("an invalid length", "length"),
+    polling.WriteFailed("meter", "power", 3),
+    TooManyValues(200, 123),
+    Refused("power", "power: too large"),
+    adapters.Refused("empty", "values are empty", command=1),
+    holdfast.TagError("scale", "scale is 0"),
+    holdfast.ConfigError("b.yaml", PROBLEMS),
+    importing.NotImportable("b.yaml", PROBLEMS, ()),
+    raw_ingest.RawTlsFailed("plc: expired", "expired", maybe_written=False),
+    *(
+        kind("plc: lost", maybe_written=True)
+        for kind in (raw_ingest.RawError, raw_ingest.RawRefused, raw_ingest.RawTimeout)
+    ),
+]
+# The others have a text only.
+ERRORS += [error("text") for error in PUBLIC_ERRORS if error not in map(type, ERRORS)]
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
 def test_an_error_survives_a_process_pool(error: Exception) -> None:
     for copied in (pickle.loads(pickle.dumps(error)), copy.copy(error)):
         assert (type(copied), str(copied), vars(copied)) == (type(error), str(error), vars(error))

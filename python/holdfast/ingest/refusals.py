@@ -31,10 +31,13 @@ class Refused(Exception):
     is_recorded = False
 
     def __init__(self, reason: str, detail: str, **where: Any) -> None:
-        super().__init__(detail)
+        super().__init__(reason, detail)  # Its arguments, so that it can be pickled.
         self.reason = reason
         self.detail = detail
         self.where = where
+
+    def __str__(self) -> str:
+        return self.detail
 
     def answer(self) -> dict[str, object]:
         """Returns the answer for the source."""

@@ -19,10 +19,16 @@ class RawError(Exception):
     `maybe_written`: the whole packet was sent, but no valid reply arrived.
     """
 
-    def __init__(self, what: str, *, maybe_written: bool) -> None:
-        outcome = "the packet may have been written" if maybe_written else "nothing was written"
-        super().__init__(f"{what}; {outcome}")
+    def __init__(self, what: str, maybe_written: bool) -> None:
+        # Not by the constructor: `OSError` takes two arguments for an errno and its text.
+        super().__init__()
+        self.args = what, maybe_written
+        self.what = what
         self.maybe_written = maybe_written
+
+    def __str__(self) -> str:
+        outcome = "the packet may have been written"
+        return f"{self.what}; {outcome if self.maybe_written else 'nothing was written'}"
 
 
 class RawRefused(RawError):
@@ -36,8 +42,9 @@ class RawTimeout(RawError, TimeoutError):
 class RawTlsFailed(RawError):
     """TLS failed. `reason` is a word from docs/modbus-tls.md, such as `expired` or `wrong_name`."""
 
-    def __init__(self, what: str, reason: str, *, maybe_written: bool) -> None:
-        super().__init__(what, maybe_written=maybe_written)
+    def __init__(self, what: str, reason: str, maybe_written: bool) -> None:
+        super().__init__(what, maybe_written)
+        self.args = what, reason, maybe_written
         self.reason = reason
 
 
