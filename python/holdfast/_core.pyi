@@ -265,9 +265,11 @@ class Memory:
         """
 
     def on_write(
-        self, callback: Callable[[Area, int, list[int]], object], *, clients_only: bool = False
+        self, callback: Callable[[str, int, list[int]], object], *, clients_only: bool = False
     ) -> WriteCallback:
         """Calls `callback(area, address, values)` after every write to this memory.
+
+        The area of records is `file:NUMBER`, as in `write`.
 
         Writes are those of Modbus clients and of everything else, also of this program; with
         `clients_only`, only those of Modbus clients. A write that changes no value is one too, and
@@ -397,8 +399,8 @@ class Follower:
 class WriteQueue:
     """The writes to a memory, in their order. It is bounded: it drops the oldest writes."""
 
-    def next(self, timeout: float) -> tuple[Area, int, list[int]] | None:
-        """Waits for the next write: area, address, values.
+    def next(self, timeout: float) -> tuple[str, int, list[int]] | None:
+        """Waits for the next write: area or file, address, values.
 
         Returns `None` after `timeout` seconds, and when the queue is closed.
         """

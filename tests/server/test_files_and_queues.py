@@ -238,8 +238,13 @@ def test_requests_are_counted(run: Run) -> None:
 
 def test_a_memory_of_a_script_has_files_and_queues(connect: Connect) -> None:
     memory = holdfast.Memory(holding_registers=10, files=FILES)
-    seen: list[tuple[str, int, list[int]]] = []
-    calls = memory.on_write(lambda *call: seen.append(call), clients_only=True)
+    seen: list[tuple[bool, int, list[int]]] = []
+
+    # A type checker knows that it may be a file.
+    calls = memory.on_write(
+        lambda area, address, values: seen.append((area == "file:4", address, values)),
+        clients_only=True,
+    )
     rules = [holdfast.Rule({1: memory}, sources=["127.0.0.1"], access="read-write", fifo={1: [5]})]
     with holdfast.Server(bind="127.0.0.1:0", rules=rules) as server:
         client = connect(server.address)
@@ -247,7 +252,7 @@ def test_a_memory_of_a_script_has_files_and_queues(connect: Connect) -> None:
         assert client.ask(bytes.fromhex("180005")).hex() == "1800020000"
         wire.until(lambda: bool(seen), "the callback is called")
     calls.close()
-    assert seen == [("file:4", 7, [0x06AF, 0x04BE, 0x100D])]
+    assert seen == [(True, 7, [0x06AF, 0x04BE, 0x100D])]
     assert memory.files == FILES
     assert list(memory.areas) == ["holding_registers"]
     assert "file:3=11" in repr(memory)

@@ -243,6 +243,8 @@ impl Memory {
 
     /// Calls `callback(area, address, values)` after every write to this memory.
     ///
+    /// The area of records is `file:NUMBER`, as in `write`.
+    ///
     /// Writes are those of Modbus clients and of everything else, also of this program; with
     /// `clients_only`, only those of Modbus clients. A write that changes no value is one too, and
     /// a write of several ranges is several calls. The calls are in the order of the writes, on one

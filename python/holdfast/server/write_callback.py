@@ -12,9 +12,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from holdfast._core import WriteQueue
-    from holdfast.types import Area
 
-    Written = Callable[[Area, int, list[int]], object]
+    Written = Callable[[str, int, list[int]], object]
 
 WAIT_S = 3600.0
 """Seconds of one wait for a write. It ends when the queue is closed."""
