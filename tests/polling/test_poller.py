@@ -14,7 +14,7 @@ import pytest
 
 import holdfast
 from holdfast import Tag, TagList
-from holdfast.polling import Poller, Reading, WriteFailed
+from holdfast.polling import Batch, DevicePoll, Poller, Reading, WriteFailed
 from holdfast.polling import poller as poller_module
 from holdfast.polling.faults import NO_CONNECTION
 from holdfast.tags.scale import RegisterScale
@@ -406,6 +406,35 @@ def test_a_batch_that_a_cancelled_task_waited_for_is_not_lost(device: holdfast.S
             [reading] = await asyncio.wait_for(first(made), wire.DEADLINE)
             assert reading.value is True
         assert [batch async for batch in made] == []
+
+    asyncio.run(steps())
+
+
+@pytest.mark.parametrize("is_async", [True, False])
+def test_a_cancelled_wait_ends_neither_the_iteration_nor_loses_its_batch(
+    is_async: bool, device: holdfast.Server, poller: Poller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    is_made = threading.Event()
+
+    def noted(polls: list[DevicePoll]) -> Batch:
+        is_made.set()
+        return Batch(polls)
+
+    monkeypatch.setattr(poller_module, "Batch", noted)
+
+    async def steps() -> None:
+        batches = aiter(poller)
+        waiting = asyncio.ensure_future(anext(batches))
+        await asyncio.sleep(0)
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+        poller.add(url(device), {"x": ("coils", 3)}, interval=3600)
+        assert is_made.wait(wire.DEADLINE)
+        following = anext(batches) if is_async else asyncio.to_thread(poller.take, wire.DEADLINE)
+        batch = await asyncio.wait_for(following, wire.DEADLINE)
+        assert batch is not None
+        assert [reading.value for reading in batch] == [True]
 
     asyncio.run(steps())
 

@@ -31,7 +31,7 @@ from holdfast.tags import Tag, TagList
 from holdfast.tags.read_gap import DEFAULT_MAX_GAP
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Iterator
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
     from concurrent.futures import Future
 
     from holdfast.polling.readings import DevicePoll
@@ -94,8 +94,10 @@ class Poller:
         self._generations = itertools.count(1)
         self._process = os.getpid()
         self._thread: OwnThread | None = None
-        self._pending: Future[Batch | None] | None = None
-        """Of no event loop: the next iteration may be in another one."""
+        self._given_up: deque[Future[Batch | None]] = deque()
+        """Batches that a task waited for until it was cancelled. The first goes to whoever asks
+        next, also in another event loop.
+        """
         self._has_ended = False
         self._queued: deque[tuple[str, float, list[Any]]] = deque()
 
@@ -245,6 +247,22 @@ class Poller:
     def take(self, timeout: float | None = None) -> Batch | None:
         """The next batch; `None` if none comes within `timeout` seconds, or after `close`."""
         self._check_process()
+        began = time.monotonic()
+        if self._given_up:
+            asked = self._given_up.popleft()
+            try:
+                batch = asked.result(timeout and min(timeout, MAX_TIMEOUT_S))
+            except BaseException as error:
+                self._given_up.appendleft(asked)
+                if isinstance(error, TimeoutError):
+                    return None
+                raise
+            if batch is not None:
+                return batch
+        return self._within(timeout and timeout - (time.monotonic() - began))
+
+    def _within(self, timeout: float | None) -> Batch | None:
+        """The next batch that nobody has asked for."""
         end = None if timeout is None else time.monotonic() + timeout
         while True:
             left = SIGNAL_CHECK_S if end is None else min(SIGNAL_CHECK_S, end - time.monotonic())
@@ -284,7 +302,11 @@ class Poller:
         while (batch := self.take()) is not None:
             yield batch
 
-    async def __aiter__(self) -> AsyncIterator[Batch]:
+    def __aiter__(self) -> AsyncIterator[Batch]:
+        return _Batches(self._next)
+
+    async def _next(self) -> Batch | None:
+        """The next batch; `None` after `close`."""
         import asyncio  # Who iterates over it without a loop does not need it.
 
         from holdfast.runtime.own_thread import OwnThread
@@ -293,15 +315,18 @@ class Poller:
             self._thread = OwnThread("holdfast-poller")
         while True:
             self._check_process()
-            if self._pending is None or self._pending.cancelled():
-                self._pending = self._thread.submit(partial(self.take, ABANDON_CHECK_S))
-            # One that runs can't be cancelled: its batch is the first of the next iteration.
-            batch = await asyncio.wrap_future(self._pending)
-            self._pending = None
-            if batch is not None:
-                yield batch
-            elif self._has_ended:
-                return
+            if self._given_up:
+                asked = self._given_up.popleft()
+            else:
+                asked = self._thread.submit(partial(self._within, ABANDON_CHECK_S))
+            try:
+                batch = await asyncio.wrap_future(asked)
+            except (asyncio.CancelledError, GeneratorExit):
+                if not asked.cancel():  # It has begun.
+                    self._given_up.append(asked)
+                raise
+            if batch is not None or self._has_ended:
+                return batch
 
     def close(self) -> None:
         """Stops polling. Batches that wait can still be taken."""
@@ -319,6 +344,22 @@ class Poller:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class _Batches:
+    """An iteration of a task. A wait that is cancelled, as by a timeout, does not end it."""
+
+    def __init__(self, following: Callable[[], Awaitable[Batch | None]]) -> None:
+        self._following = following
+
+    def __aiter__(self) -> Self:
+        return self
+
+    async def __anext__(self) -> Batch:
+        batch = await self._following()
+        if batch is None:
+            raise StopAsyncIteration
+        return batch
 
 
 def _tags(tags: Mapping[str, Tag | tuple[Any, ...]]) -> Iterator[Tag]:
