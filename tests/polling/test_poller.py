@@ -7,6 +7,7 @@ import asyncio
 import itertools
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ import pytest
 
 import holdfast
 from holdfast import Tag, TagList
+from holdfast.client.endpoint import endpoint
 from holdfast.polling import Batch, DevicePoll, Poller, Reading, WriteFailed
 from holdfast.polling import poller as poller_module
 from holdfast.polling.faults import NO_CONNECTION
@@ -227,6 +229,28 @@ def test_devices_can_be_added_and_removed(device: holdfast.Server, poller: Polle
         poller.remove(names[0])
 
 
+def test_devices_can_be_added_and_removed_by_several_threads(
+    poller: Poller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def yields(target: Any) -> Any:
+        time.sleep(0)  # Another thread may run.
+        return endpoint(target)
+
+    monkeypatch.setattr(poller_module, "endpoint", yields)
+    together = threading.Barrier(4)
+
+    def add(_: int) -> list[str]:
+        together.wait()
+        return [poller.add("tcp://127.0.0.1:1", {"x": ("coils", 0)}) for _ in range(5)]
+
+    with ThreadPoolExecutor(4) as threads:
+        names = [name for added in threads.map(add, range(4)) for name in added]
+        assert len(set(names)) == 20
+        assert poller.counters().keys() == set(names)
+        list(threads.map(poller.remove, names))
+    assert poller.counters() == {}
+
+
 def test_queued_polls_of_a_removed_device_are_not_those_of_the_next(
     device: holdfast.Server, poller: Poller
 ) -> None:
@@ -414,23 +438,24 @@ def test_a_batch_that_a_cancelled_task_waited_for_is_not_lost(device: holdfast.S
 def test_a_cancelled_wait_ends_neither_the_iteration_nor_loses_its_batch(
     is_async: bool, device: holdfast.Server, poller: Poller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    is_made = threading.Event()
+    has_come, is_cancelled = threading.Event(), threading.Event()
 
-    def noted(polls: list[DevicePoll]) -> Batch:
-        is_made.set()
+    def late(polls: list[DevicePoll]) -> Batch:
+        has_come.set()
+        is_cancelled.wait(wire.DEADLINE)
         return Batch(polls)
 
-    monkeypatch.setattr(poller_module, "Batch", noted)
+    monkeypatch.setattr(poller_module, "Batch", late)
+    poller.add(url(device), {"x": ("coils", 3)}, interval=3600)
 
     async def steps() -> None:
         batches = aiter(poller)
         waiting = asyncio.ensure_future(anext(batches))
-        await asyncio.sleep(0)
+        assert await asyncio.to_thread(has_come.wait, wire.DEADLINE)
         waiting.cancel()
         with pytest.raises(asyncio.CancelledError):
             await waiting
-        poller.add(url(device), {"x": ("coils", 3)}, interval=3600)
-        assert is_made.wait(wire.DEADLINE)
+        is_cancelled.set()
         following = anext(batches) if is_async else asyncio.to_thread(poller.take, wire.DEADLINE)
         batch = await asyncio.wait_for(following, wire.DEADLINE)
         assert batch is not None

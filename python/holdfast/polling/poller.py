@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import threading
 import time
 from collections import deque
 from collections.abc import Mapping
@@ -90,6 +91,8 @@ class Poller:
         """The connection of each device, by its name in the core."""
         self._connections: dict[tuple[str, str], tuple[dict[str, object], set[str]]] = {}
         """The options of each connection, and its devices."""
+        self._changing = threading.RLock()
+        """Of all that `add` and `remove` change. A signal handler may call them too."""
         self._names = itertools.count(1)
         self._generations = itertools.count(1)
         self._process = os.getpid()
@@ -138,47 +141,48 @@ class Poller:
         listed = tags if isinstance(tags, TagList) else TagList(_tags(tags))
         if not len(listed):
             raise ValueError("tags is empty, allowed: at least one tag")
-        if name is None:
-            name = url.partition("://")[2] or url
+        with self._changing:
+            if name is None:
+                name = url.partition("://")[2] or url
+                if name in self._core_names:
+                    name = f"{name}#{next(self._names)}"
             if name in self._core_names:
-                name = f"{name}#{next(self._names)}"
-        if name in self._core_names:
-            raise ValueError(f"device {name}: the name is already in use")
-        place = shared_connection(target)
-        if (other := other_name(target, self._connections)) is not None:
-            named = f"{url!r} is the serial line of other devices under another name"
-            raise ValueError(f"{named}, allowed: {other!r}")
-        options = shared_options(target) | {"in_flight": in_flight}
-        known, users = self._connections.get(place, (options, set()))
-        for option, value in options.items():
-            if value != known[option]:
-                others = f"other devices at this address have {known[option]!r}"
-                raise ValueError(f"{url!r}: {option} is {value!r}, but {others}, allowed: the same")
-        core_name = f"{name}#{next(self._generations)}"
-        reader = Reader(name, listed)
-        self._poller.add(
-            _core.PolledDevice(
-                core_name,
-                endpoint(target),
-                unit=unit,
-                interval=interval,
-                timeout=timeout,
-                reads=[],
-                fields=list(reader.fields),
-                receiver=self._results,
-                max_gap=max_gap,
-                max_registers=max_registers,
-                max_bits=max_bits,
-                in_flight=in_flight,
-                start_within=min(interval, SIGNAL_CHECK_S * len(self._readers)),
+                raise ValueError(f"device {name}: the name is already in use")
+            place = shared_connection(target)
+            if (other := other_name(target, self._connections)) is not None:
+                named = f"{url!r} is the serial line of other devices under another name"
+                raise ValueError(f"{named}, allowed: {other!r}")
+            options = shared_options(target) | {"in_flight": in_flight}
+            known, users = self._connections.get(place, (options, set()))
+            for option, value in options.items():
+                if value != known[option]:
+                    others = f"but other devices at this address have {known[option]!r}"
+                    raise ValueError(f"{url!r}: {option} is {value!r}, {others}, allowed: the same")
+            core_name = f"{name}#{next(self._generations)}"
+            reader = Reader(name, listed)
+            self._poller.add(
+                _core.PolledDevice(
+                    core_name,
+                    endpoint(target),
+                    unit=unit,
+                    interval=interval,
+                    timeout=timeout,
+                    reads=[],
+                    fields=list(reader.fields),
+                    receiver=self._results,
+                    max_gap=max_gap,
+                    max_registers=max_registers,
+                    max_bits=max_bits,
+                    in_flight=in_flight,
+                    start_within=min(interval, SIGNAL_CHECK_S * len(self._readers)),
+                )
             )
-        )
-        users.add(core_name)
-        self._connections[place] = known, users
-        self._places[core_name] = place
-        self._readers[core_name] = reader
-        self._core_names[name] = core_name
-        return name
+            users.add(core_name)
+            self._connections[place] = known, users
+            self._places[core_name] = place
+            self._readers[core_name] = reader
+            self._core_names[name] = core_name
+            return name
 
     def remove(self, name: str) -> None:
         """Stops polling a device. Writes to it that wait are not sent, and fail.
@@ -186,14 +190,15 @@ class Poller:
         Raises `KeyError` for an unknown name.
         """
         self._check_process()
-        core_name = self._core_names.pop(name)
-        del self._readers[core_name]
-        place = self._places.pop(core_name)
-        _, users = self._connections[place]
-        users.remove(core_name)
-        if not users:
-            del self._connections[place]
-        self._poller.remove(core_name)
+        with self._changing:
+            core_name = self._core_names.pop(name)
+            del self._readers[core_name]
+            place = self._places.pop(core_name)
+            _, users = self._connections[place]
+            users.remove(core_name)
+            if not users:
+                del self._connections[place]
+            self._poller.remove(core_name)
 
     def write(self, name: str, tag: str, value: Any) -> None:
         """Writes a value, or the name of a state, between two reads of the device.
