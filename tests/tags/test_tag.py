@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from array import array
+from decimal import Decimal
+from fractions import Fraction
 from typing import Any
 
 import pytest
@@ -75,7 +77,7 @@ def test_what_is_read_can_be_written_and_gives_the_same_registers(
             "21.53 is between two values of the registers, allowed: steps of 0",
         ),
         (31, {"min": 5, "max": 30}, "31 is outside 5 to 30"),
-        (4, {"min": 5}, "4 is outside 5 to"),
+        (4, {"min": 5}, "4 is outside the limits, allowed: at least 5$"),
         (
             1.5,
             {},
@@ -87,8 +89,13 @@ def test_what_is_read_can_be_written_and_gives_the_same_registers(
         (True, {}, "True is not a number"),
         ("on", {}, "'on' is not a number"),
         ("on", {"states": {0: "off", 1: "running"}}, "'on' is no state, allowed: off, running"),
-        (31, {"max": 30}, "31 is outside to 30$"),
-        (4.5, {"min": 5}, r"4\.5 is outside 5 to$"),
+        (31, {"max": 30}, "31 is outside the limits, allowed: up to 30$"),
+        (Decimal("1.5"), {}, "1.5 is between two values of the registers"),
+        (Decimal("NaN"), {}, "nan is not a finite number"),
+        (Decimal("sNaN"), {}, "is not a number"),
+        (Decimal("-1e999999999"), {}, "a Fraction is too large"),
+        (Decimal("1e-999999999"), {}, "is between two values of the registers"),
+        (Fraction(10**400), {}, "a Fraction is too large"),
         (10**400, {}, "an integer of 1329 bits is too large"),
         (-(10**400), {"type": "float64"}, "an integer of 1329 bits is too large"),
         (1e308, {"type": "float32", "scale": 0.001}, r"1e\+308 does not fit float32$"),
@@ -106,6 +113,25 @@ def test_a_value_that_does_not_fit_is_refused(
 ) -> None:
     with pytest.raises(DoesNotFit, match=message):
         tag(**settings).raw(value)
+
+
+@pytest.mark.parametrize(
+    ("value", "settings", "number"),
+    [
+        (Decimal("21.5"), {"scale": 0.1, "max": 21.5}, 215),
+        (Decimal("0.1"), {"scale": 0.1, "min": 0.1}, 1),
+        (Decimal("1E+2"), {}, 100),
+        (Decimal("0E-999999999"), {}, 0),
+        (Fraction(43, 2), {"scale": 0.1}, 215),
+        ([Decimal(1), 2], {"type": "uint16[2]"}, [1, 2]),
+        (Decimal("0.1"), {"type": "float32"}, 0.1),
+        (Decimal(2**64 + 1) / 2**12, {"type": "float64", "scale": 0.5}, 2.0**53),
+    ],
+)
+def test_decimals_and_fractions_are_numbers(
+    value: Any, settings: dict[str, Any], number: Any
+) -> None:
+    assert tag(**settings).raw(value) == number
 
 
 @pytest.mark.parametrize(
@@ -153,13 +179,37 @@ def test_limits_hold_for_the_rounded_value() -> None:
 @pytest.mark.parametrize(
     ("value", "settings", "message"),
     [
-        (1001.3, {"max": 1001.3}, r"^1001\.3 is 1001\.5 in float16, outside to 1001\.3$"),
-        (1000.7, {"min": 1000.7}, r"^1000\.7 is 1000\.5 in float16, outside 1000\.7 to$"),
-        (160.22, {"max": 160.22}, r"160\.22 is 160\.25 in float16, outside to 160\.22"),
-        (0.1, {"min": 0.1}, r"0\.1 is 0\.0999755859375 in float16, outside 0\.1 to"),
+        (
+            1001.3,
+            {"max": 1001.3},
+            r"^1001\.3 is 1001\.5 in float16, outside the limits",
+        ),
+        (
+            1000.7,
+            {"min": 1000.7},
+            r"^1000\.7 is 1000\.5 in float16, outside the limits",
+        ),
+        (
+            160.22,
+            {"max": 160.22},
+            r"160\.22 is 160\.25 in float16, outside the limits",
+        ),
+        (
+            0.1,
+            {"min": 0.1},
+            r"0\.1 is 0\.0999755859375 in float16, outside the limits",
+        ),
         (2049, {"min": 2049, "max": 3000}, "2049 is 2048.0 in float16, outside 2049 to 3000"),
-        (100.13, {"max": 100.13, "scale": 0.1}, "100.13 is 100.15 in float16, outside to 100.13"),
-        (5.3, {"max": 5.3, "offset": -1000}, "5.3 is 5.5 in float16, outside to 5.3"),
+        (
+            100.13,
+            {"max": 100.13, "scale": 0.1},
+            "100.13 is 100.15 in float16, outside the limits",
+        ),
+        (
+            5.3,
+            {"max": 5.3, "offset": -1000},
+            "5.3 is 5.5 in float16, outside the limits",
+        ),
         ([1, 1001.3], {"max": 1001.3, "type": "float16[2]"}, "1001.3 is 1001.5 in float16, "),
     ],
 )

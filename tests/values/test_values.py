@@ -10,6 +10,7 @@ import struct
 import sys
 from array import array
 from collections import deque
+from decimal import Decimal
 from fractions import Fraction
 from itertools import permutations
 from pathlib import Path
@@ -638,7 +639,9 @@ def test_what_is_no_integer_is_refused(name: str, value: Any) -> None:
 
 
 @pytest.mark.parametrize("name", MAX_VALUE)
-@pytest.mark.parametrize("value", [True, False, "1", b"1", None, [1.0], 1j], ids=repr)
+@pytest.mark.parametrize(
+    "value", [True, False, "1", b"1", None, [1.0], 1j, Decimal("sNaN")], ids=repr
+)
 def test_what_is_no_number_is_refused(name: str, value: Any) -> None:
     with pytest.raises(values.DoesNotFit, match=f" is not a number, which {name} requires$"):
         encode(value, name)
@@ -649,7 +652,7 @@ def test_a_float_too_large_is_refused_and_no_infinity(name: str, most: float) ->
     beyond: list[Any] = (
         [10**400, Fraction(10**400)]
         if name == "float64"
-        else [most * 1.01, 1e300, Fraction(10**400)]
+        else [most * 1.01, 1e300, Fraction(10**400), Decimal("1e999999")]
     )
     for value in (most, -most):
         assert decode(encode(value, name), name) == value
@@ -666,7 +669,7 @@ LEAST_VALUE = {"float16": 2.0**-24, "float32": 2.0**-149, "float64": 5e-324}
 
 @pytest.mark.parametrize(("name", "least"), LEAST_VALUE.items())
 def test_a_number_that_would_be_0_is_refused(name: str, least: float) -> None:
-    small: list[Any] = [least / 2, 1e-300, Fraction(least) / 3]
+    small: list[Any] = [least / 2, 1e-300, Fraction(least) / 3, Decimal("1e-999999")]
     if name == "float64":
         small = [Fraction(1, 10**400)]
     for value in (0.0, -0.0, least, -least):
@@ -691,6 +694,10 @@ def test_floats_hold_infinities_and_nan(name: str, order: str) -> None:
 def test_a_float_may_be_given_as_any_real_number() -> None:
     assert encode(2, "float32") == encode(2.0, "float32")
     assert encode(Fraction(1, 2), "float32") == encode(0.5, "float32")
+    assert encode(Decimal("-0.1"), "float32") == encode(-0.1, "float32")
+    assert encode([Decimal("NaN"), Decimal("Infinity")], "float64[2]") == encode(
+        [math.nan, math.inf], "float64[2]"
+    )
     assert encode([Fraction(1, 2), 2, 0.5], "float16[3]") == encode([0.5, 2.0, 0.5], "float16[3]")
 
 

@@ -158,7 +158,7 @@ def plain_number(key: str, given: object) -> float:
     return number
 
 
-def is_finite(number: float) -> bool:
+def is_finite(number: float | Fraction) -> bool:
     """Whether a number is finite, and no integer beyond all floats."""
     try:
         return math.isfinite(number)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 from holdfast.protocol import WRITE_LIMITS
@@ -11,7 +12,7 @@ from holdfast.tags.scale import RegisterScale, ScaledTag, is_finite
 from holdfast.types import BIT_AREAS
 from holdfast.values import DoesNotFit
 from holdfast.values.errors import shown
-from holdfast.values.numeric import nearest_float
+from holdfast.values.numeric import as_real, nearest_float
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -68,11 +69,15 @@ class WritableTag(ScaledTag):
             value = self._named(value)
         if not self.is_number:
             return value
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        real = as_real(value)
+        if not isinstance(real, int | float | Fraction):
             raise DoesNotFit(f"{value!r} is not a number")
-        if not is_finite(value):
-            flaw = "too large" if isinstance(value, int) else "not a finite number"
-            raise DoesNotFit(f"{shown(value)} is {flaw}")
+        if not is_finite(real):
+            flaw = "not a finite number" if isinstance(real, float) else "too large"
+            raise DoesNotFit(f"{shown(real)} is {flaw}")
+        # A float means what is written: as such, 0.1 is equal to a `min` of 0.1.
+        is_float = isinstance(real, Fraction) and Fraction(repr(float(real))) == real
+        value = float(real) if is_float else real
         if isinstance(self.scale, RegisterScale):
             raise DoesNotFit(self.unscaled)
         number = self._number(value, abs(self.scale), default_round)
@@ -131,10 +136,10 @@ class WritableTag(ScaledTag):
     def _check_limits(self, value: float, found: str) -> None:
         least, most = self.min, self.max
         if (least is not None and value < least) or (most is not None and value > most):
-            allowed = (
-                f"{'' if least is None else f'{least} '}to{'' if most is None else f' {most}'}"
-            )
-            raise DoesNotFit(f"{found} outside {allowed}")
+            if least is not None and most is not None:
+                raise DoesNotFit(f"{found} outside {least} to {most}")
+            allowed = f"up to {most}" if least is None else f"at least {least}"
+            raise DoesNotFit(f"{found} outside the limits, allowed: {allowed}")
 
     def _named(self, name: str) -> int:
         for value, known in self.states.items():

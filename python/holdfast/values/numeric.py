@@ -35,6 +35,30 @@ MAX_EXACT = 1 << 53
 """The integers up to this one are floats too."""
 
 
+MAX_EXPONENT = 400
+"""Of a `Decimal` that becomes a fraction. No float has as large or as small a number."""
+
+
+def as_real(value: Any) -> Any:
+    """A number of any library, also a `Decimal`, exactly; `None` for anything else."""
+    if isinstance(value, bool):
+        return None
+    if isinstance(value, Real):
+        return value
+    from decimal import Decimal  # Who has none does not need it.
+    from fractions import Fraction
+
+    if not isinstance(value, Decimal) or value.is_snan():
+        return None
+    if not value or not value.is_finite():
+        return float(value)
+    exponent = value.adjusted()
+    if abs(exponent) > MAX_EXPONENT:  # Its fraction would fill the memory.
+        exponent = MAX_EXPONENT if exponent > 0 else -MAX_EXPONENT
+        value = Decimal((int(value.is_signed()), (1,), exponent))
+    return Fraction(value)
+
+
 def limits(base: str) -> tuple[float, float]:
     """The least and the greatest number of a type. Of integers and BCD, both are integers."""
     if base in FLOAT_MAX:
@@ -169,10 +193,11 @@ class Float(Number):
         )
 
     def _number(self, value: Any) -> float:
-        if isinstance(value, bool) or not isinstance(value, Real):
+        real = as_real(value)
+        if real is None:
             raise DoesNotFit(f"{shown(value)} is not a number, which {self.name} requires")
         integer = as_integer(value)  # Those of NumPy are rounded to compare them with floats.
-        number = round_to_odd(value if integer is None else integer, self.name)
+        number = round_to_odd(real if integer is None else integer, self.name)
         # A float of numpy with more bits, which `float` does not refuse.
         if isinf(number) and value != number:
             raise OverflowError
