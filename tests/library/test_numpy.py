@@ -14,6 +14,7 @@ from holdfast import raw_ingest, values
 from holdfast._core import Batch
 from holdfast.tags import TagError
 from holdfast.values import DoesNotFit, Field, Layout
+from support.brokers import free_port
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -245,6 +246,8 @@ def test_raw_ingest_takes_them() -> None:
     )
     with pytest.raises(TypeError, match="address is"):
         raw_ingest.encode("coils", FLOAT, [1], unit=1)
+    with pytest.raises(raw_ingest.RawError, match="nothing was written"):
+        raw_ingest.send_sync("127.0.0.1", numpy.int64(free_port()), "coils", 0, [1], unit=1)
 
 
 def test_numpy_is_not_imported() -> None:

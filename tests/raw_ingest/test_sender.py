@@ -568,15 +568,16 @@ def test_receivers_have_ipv6_addresses_too(send: Send, receiver: Receive) -> Non
         ("127.0.0.1", 9000, 0.0, "timeout is 0.0, allowed: more than 0 seconds"),
         ("127.0.0.1", 9000, float("nan"), "timeout is nan, allowed: more than 0 seconds"),
         ("127.0.0.1", 9000, float("inf"), "timeout is inf, allowed: more than 0 seconds"),
+        ("127.0.0.1", 9000, None, "timeout is None, allowed: more than 0 seconds"),
         ("", 9000, 1.0, "'' is not a host name"),
         ("a..b", 9000, 1.0, "'a..b' is not a host name"),
         ("10.0.0.010", 9000, 1.0, "'10.0.0.010' is not a host name"),
     ],
 )
 def test_arguments_that_can_not_be_are_refused(
-    send: Send, host: str, port: int, timeout: float, text: str
+    send: Send, host: str, port: int, timeout: Any, text: str
 ) -> None:
-    with pytest.raises(ValueError, match=f"^{text}$"):
+    with pytest.raises(TypeError if timeout is None else ValueError, match=f"^{text}$"):
         send(host, port, timeout=timeout)
 
 

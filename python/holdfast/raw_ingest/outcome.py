@@ -61,13 +61,18 @@ class Attempt:
     """The progress of one packet, and its outcome."""
 
     def __init__(self, host: str, port: int, timeout: float) -> None:
-        checked_field("port", port, least=1)
-        if not 0 < timeout < math.inf:
-            raise ValueError(f"timeout is {timeout}, allowed: more than 0 seconds")
+        self.port = checked_field("port", port, least=1)
+        refusal = f"timeout is {timeout!r}, allowed: more than 0 seconds"
+        try:
+            is_time = 0 < timeout < math.inf
+        except TypeError:
+            raise TypeError(refusal) from None
+        if not is_time:
+            raise ValueError(refusal)
+        self.timeout = float(timeout)
         if not is_host(host):
             raise ValueError(f"{reprlib.repr(host)} is not a host name")
-        self.peer = joined(host, port)
-        self.timeout = timeout
+        self.peer = joined(host, self.port)
         self.connected = False
         self.sent = False
 

@@ -78,11 +78,11 @@ async def send_packet(
     connection, also when the task is cancelled.
     """
     attempt = Attempt(host, port, timeout)
-    channel = None if tls is None else await asyncio.to_thread(_channel, host, port, tls)
-    deadline = asyncio.get_running_loop().time() + timeout
+    channel = None if tls is None else await asyncio.to_thread(_channel, host, attempt.port, tls)
+    deadline = asyncio.get_running_loop().time() + attempt.timeout
     try:
         async with asyncio.timeout_at(deadline):
-            connection = await connected(await addresses(host, port), deadline)
+            connection = await connected(await addresses(host, attempt.port), deadline)
             with connection:
                 if channel is None:
                     reply = await exchange(attempt, connection, packet)
@@ -98,10 +98,10 @@ def send_packet_sync(
 ) -> None:
     """Like `send_packet`, without an event loop."""
     attempt = Attempt(host, port, timeout)
-    channel = None if tls is None else _channel(host, port, tls)
-    deadline = time.monotonic() + timeout
+    channel = None if tls is None else _channel(host, attempt.port, tls)
+    deadline = time.monotonic() + attempt.timeout
     try:
-        with connected_sync(host, port, deadline) as connection:
+        with connected_sync(host, attempt.port, deadline) as connection:
             if channel is None:
                 reply = exchange_sync(attempt, connection, packet, deadline)
             else:
