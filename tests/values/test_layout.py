@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import re
 import struct
 from array import array
@@ -234,6 +236,14 @@ def test_every_field_has_a_value_and_every_value_a_field() -> None:
         layout.encode({"a": 1, "c": 1})
     with pytest.raises(values.DoesNotFit, match=r"^the layout has no field 'c'$"):
         layout.encode({"a": 1, "b": 1, "c": 1})
+    with pytest.raises(TypeError, match="^values are a list, allowed: a mapping"):
+        layout.encode([1, 2])  # type: ignore[arg-type]
+
+
+def test_a_layout_can_be_copied() -> None:
+    layout = Layout([("a", "uint16", 0), ("b", "float32", 2)], size=6)
+    for copied in (pickle.loads(pickle.dumps(layout)), copy.deepcopy(layout)):
+        assert copied.decode([1, 0, 0x3F80, 0, 0, 0]) == {"a": 1, "b": 1.0}
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -66,6 +67,9 @@ class Layout:
         self._values = _Reading(self.names, self._codecs, offsets, self.size).values
         self._overlap = _overlap(self.fields, self._codecs)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(Layout, size=self.size), (self.fields,)
+
     def decode(self, registers: Registers) -> dict[str, Any]:
         """The values of all fields by name, in the order of `names`.
 
@@ -83,8 +87,9 @@ class Layout:
 
         Bits outside all fields are copied from `base`, a block of the same size. Default: 0.
 
-        Raises `InvalidLayout` if fields overlap, `DoesNotFit` if names are missing or unknown, and
-        the errors of `encode`, with the name of the field in the message and in `field`.
+        Raises `InvalidLayout` if fields overlap, `DoesNotFit` if names are missing or unknown,
+        `TypeError` for what is not a mapping, and the errors of `encode`, with the name of the
+        field in the message and in `field`.
         """
         if self._overlap is not None:
             first, second = self._overlap
@@ -104,6 +109,9 @@ class Layout:
         return self._block.unpack(block)
 
     def _check_names(self, values: Mapping[str, Any]) -> None:
+        if not isinstance(values, Mapping):
+            found = f"values are a {type(values).__name__}"
+            raise TypeError(f"{found}, allowed: a mapping with a value for each field")
         if values.keys() == set(self.names):
             return
         for name in self.names:
