@@ -95,7 +95,7 @@ def test_scale_markers_and_states_are_those_of_the_tag(
     device: holdfast.Server, poller: Poller
 ) -> None:
     scaled = Tag("t", "holding_registers", 5, scale=0.1, unit="°C")
-    none = Tag("n", "holding_registers", 6, null=frozenset([65535]))
+    none = Tag("n", "holding_registers", 6, null={65535})
     poller.add(url(device), TagList([scaled, none]), name="oven")
     t, n, *_ = taken(poller)
     assert (t.device, t.tag, t.value, t.fault, t.error) == ("oven", scaled, 21.5, 0, None)

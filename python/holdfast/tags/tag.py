@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any
@@ -63,7 +63,7 @@ class Tag(WritableTag):
     """The largest value that may be written."""
     states: Mapping[int, str] = field(default_factory=dict, hash=False)
     """Names of values, for tags that have a state."""
-    null: frozenset[Marker] = frozenset()
+    null: Set[Marker] = frozenset()
     """What the registers hold when no value is available; NaN never is one."""
     deadband: float = 0
     """How much a value must change to count as changed."""
@@ -288,12 +288,16 @@ def as_decoded(marker: Marker, type: Type, encoding: str | None) -> Marker:
 class TagList:
     """The tags of a device, in their order.
 
-    Raises `TagError` for two tags of one name, and for a scale that no tag of the list has.
+    Raises `TagError` for two tags of one name, and for a scale that no tag of the list has,
+    `TypeError` for what is not a `Tag`.
     """
 
     def __init__(self, tags: Iterable[Tag] = ()) -> None:
         self._tags: dict[str, Tag] = {}
         for tag in tags:
+            if not isinstance(tag, Tag):
+                example = "holdfast.Tag('flow', 'input_registers', 0, 'float32')"
+                raise TypeError(f"{tag!r} is not a tag, allowed: {example}")
             if tag.name in self._tags:
                 raise TagError("name", f"two tags have the name {tag.name!r}")
             self._tags[tag.name] = tag

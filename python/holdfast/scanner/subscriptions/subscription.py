@@ -280,7 +280,7 @@ def _of_profile(name: str, id: str, where: str, rules: Rules) -> Tag:
     if id not in profile:
         raise Refused(f"{where}: the profile {name} has no tag {id!r}")
     tag = profile[id]
-    made = (tag.area, tag.address, tag.type, tag.order, tag.null, tag.encoding)
+    made = (tag.area, tag.address, tag.type, tag.order, frozenset(tag.null), tag.encoding)
     return Tag(id, *made, profile=name, meaning=tag)
 
 
