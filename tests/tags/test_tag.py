@@ -439,11 +439,9 @@ def test_a_tag_may_end_with_its_area() -> None:
 def test_a_list_has_each_name_once() -> None:
     with pytest.raises(TagError, match="two tags have the name 't'") as caught:
         TagList([tag(), tag(address=1)])
-    with pytest.raises(
-        TypeError, match=r"^\('a', 'coils', 0\) is not a tag, allowed: holdfast.Tag"
-    ):
-        TagList([("a", "coils", 0)])  # type: ignore[list-item]
     assert caught.value.key == "name"
+    with pytest.raises(TypeError, match=r"^\('a', 'coils', 0\) is not a tag, allowed"):
+        TagList([("a", "coils", 0)])  # type: ignore[list-item]
 
 
 def test_a_list_is_a_table_of_its_tags() -> None:

@@ -236,7 +236,7 @@ def test_every_field_has_a_value_and_every_value_a_field() -> None:
         layout.encode({"a": 1, "c": 1})
     with pytest.raises(values.DoesNotFit, match=r"^the layout has no field 'c'$"):
         layout.encode({"a": 1, "b": 1, "c": 1})
-    with pytest.raises(TypeError, match="^values are a list, allowed: a mapping"):
+    with pytest.raises(TypeError, match=r"^values are a list, allowed: a mapping"):
         layout.encode([1, 2])  # type: ignore[arg-type]
 
 
