@@ -15,7 +15,7 @@ from holdfast.tags import Tag, TagList
 from support import gateway_pages
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
 from support.gateway_pages import DESK, PHONE, Opened, Pages, View, floats, opening
-from support.gateways import Names
+from support.gateways import Dialed, Names
 from support.secured import Authority, Relay, context
 
 if TYPE_CHECKING:
@@ -65,6 +65,17 @@ def test_a_device_is_connected_to_and_read(
     assert cells[0] == ["16812", "41AC", "0100 0001 1010 1100", "21.5"]
     assert cells[1][:3] == ["0", "0000", "0000 0000 0000 0000"]
     assert cells[2][:2] == ["1234", "04D2"]
+
+
+@pytest.mark.parametrize("host", ["::1", "[::1]"])
+def test_an_ipv6_address_has_brackets_before_the_port(opened: Opened, host: str) -> None:
+    dialed = Dialed({("::1", 502): ("127.0.0.1", opened.port)})
+    view = opened(allow=["[::1]/128:502"], dialed=dialed)
+    view.connect(host, 502)
+    view.read_four(0)
+    view.says("Values of [::1]:502, unit 1")
+    view.button("Write 0").click()
+    view.says("40001 of unit 1 at [::1]:502")
 
 
 def test_every_type_of_a_register_is_shown(opened: Opened) -> None:

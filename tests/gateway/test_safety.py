@@ -283,6 +283,16 @@ def test_a_write_that_is_refused_is_logged_without_its_value(log: web.Records) -
     assert "70001" not in "".join(log.lines)
 
 
+@pytest.mark.parametrize("host", ["::1", "[::1]"])
+def test_an_ipv6_address_has_brackets_before_the_port(host: str, log: web.Records) -> None:
+    with FakeDevice(registers) as gone:
+        dialed = Dialed({("::1", 502): ("127.0.0.1", gone.port)})
+    with gateways.running(allow=["[::1]/128:502"], dialed=dialed) as running:
+        answer = running.ask("/write/register", {"host": host, "address": 0, "value": 1})
+    assert answer.json["error"] == "can't connect to [::1]:502: Connection refused"
+    assert [each["target"] for each in log.of("gateway_write")] == ["[::1]:502"]
+
+
 def test_a_write_that_was_not_sent_is_told_apart(server: holdfast.Server, log: web.Records) -> None:
     with FakeDevice(registers) as gone:
         port = gone.port

@@ -97,7 +97,9 @@ def test_a_certificate_names_an_address_without_brackets_and_a_name_in_lower_cas
 
 
 def test_ipv6_has_brackets_before_a_port() -> None:
-    assert [bracketed("fd00::1"), bracketed("10.0.0.7"), bracketed("plc")] == [
+    hosts = "fd00::1", "[fd00::1]", "10.0.0.7", "plc"
+    assert [bracketed(each) for each in hosts] == [
+        "[fd00::1]",
         "[fd00::1]",
         "10.0.0.7",
         "plc",

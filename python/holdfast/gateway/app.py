@@ -213,7 +213,7 @@ class App(Application):
 
     def _request_to(self, device: RequestedDevice) -> AbstractContextManager[None]:
         where, most = (device.host.lower(), device.port), self._limits.requests_of_device
-        return self._place(where, most, f"requests to {device.host}:{device.port}")
+        return self._place(where, most, f"requests to {device.where}")
 
     async def _until_disconnect(
         self, request: Request, work: Coroutine[Any, Any, Result], *, grace: float
@@ -320,7 +320,7 @@ class App(Application):
             peer=request.peer,
             who=request.who,
             path=request.path,
-            target=f"{device.host}:{device.port}",
+            target=device.where,
             unit=device.unit,
             address=given.get("address", given.get("writeAddress", "-")),
             outcome=ended.word,

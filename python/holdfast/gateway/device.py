@@ -20,6 +20,7 @@ from holdfast.events import log_lines
 from holdfast.gateway.broadcast import is_broadcast
 from holdfast.gateway.pool import Unusable
 from holdfast.gateway.shared_devices import QueueFull
+from holdfast.net.addresses import joined
 from holdfast.net.http.fields import malformed
 from holdfast.net.http.requests import BadRequest, RequestError
 from holdfast.net.resolver import NoSuchName
@@ -94,6 +95,11 @@ class RequestedDevice:
         self._pool = pool
 
     @property
+    def where(self) -> str:
+        """The host as requested, and the port."""
+        return joined(self.host, self.port)
+
+    @property
     def target_fields(self) -> dict[str, Any]:
         """The address of the device, for answers."""
         return {"host": self.host, "port": self.port, "unitId": self.unit}
@@ -117,7 +123,7 @@ class RequestedDevice:
         reason, detail = "connection_lost" if error.maybe_sent else "no_connection", str(error)
         unsent = (ConnectFailed,) if error.maybe_sent else (ConnectFailed, TlsFailed)
         if isinstance(error, unsent):  # With the host as requested.
-            detail = f"can't connect to {self.host}:{self.port}: {error.detail}"
+            detail = f"can't connect to {self.where}: {error.detail}"
         return Failed("tls_failed" if isinstance(error, TlsFailed) else reason, detail)
 
     async def attempt(self, call: Callable[[Client], Awaitable[Result]]) -> Result:
@@ -137,7 +143,7 @@ class RequestedDevice:
         except NoSuchName as error:
             raise Failed("no_such_name", str(error)) from None
         except QueueFull:
-            detail = f"too many requests wait for {self.host}:{self.port}, try again later"
+            detail = f"too many requests wait for {self.where}, try again later"
             raise BadRequest("busy", detail) from None
         except Unusable as error:
             log_lines.refused("tls_unusable", kind="gateway", listener="gateway", error=str(error))

@@ -74,8 +74,8 @@ def covers(networks: Iterable[Network], network: Network) -> bool:
 
 
 def bracketed(host: str) -> str:
-    """Returns a host for a URL: an IPv6 address in brackets."""
-    return f"[{host}]" if ":" in host else host
+    """Returns a host for a URL: an IPv6 address in brackets, which it may have already."""
+    return f"[{host}]" if ":" in host and not host.startswith("[") else host
 
 
 def unbracketed(host: str) -> str:

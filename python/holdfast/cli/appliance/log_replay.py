@@ -33,6 +33,7 @@ from holdfast.cli.options.option import (
 from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.terminal_text import print_json
 from holdfast.events import log_lines
+from holdfast.net.addresses import joined
 from holdfast.net.nats.connection import ANSWERING
 from holdfast.net.nats_server import ServerUnusable
 from holdfast.runtime.text import listing
@@ -300,8 +301,8 @@ def _served(
     except OSError as error:
         fail(unbindable(bind, error))
     with server:
-        host, bound = server.address
+        address = joined(*server.address)
         for unit, (name, _) in enumerate(memories, start=1):
-            click.echo(f"{name}: tcp://{host}:{bound}, unit {unit}, read-only", err=as_json)
+            click.echo(f"{name}: tcp://{address}, unit {unit}, read-only", err=as_json)
         click.echo("Ctrl-C stops it.", err=as_json)
         yield

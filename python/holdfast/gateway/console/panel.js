@@ -2,6 +2,7 @@
 
 import { meaning } from "./api.js";
 import { clock, h } from "./dom.js";
+import { hostAndPort } from "./parts.js";
 
 /** How long a value that has changed is marked, in milliseconds. */
 const MARKED = 1500;
@@ -15,8 +16,7 @@ export class Panel {
     this.errors = new Map();
     this.isStale = true;
     this.time = null;
-    const { host, port, unitId } = part.device;
-    this.where = `${host}:${port}, unit ${unitId}`;
+    this.where = `${hostAndPort(part.device)}, unit ${part.device.unitId}`;
     this.heading = h("h3", { hidden: part.kind === "range" }, part.title);
     this.age = h("p", { class: "age" });
     this.why = h("p", { class: "why", hidden: true });

@@ -43,5 +43,8 @@ export function placed(tag) {
   return `${tag.area.replace("_", " ")} ${tag.address} = ${modicon(functionOf(tag), tag.address)}, ${tag.type}${order}${scale}${offset}`;
 }
 
+/** Returns the host and the port of a device, an IPv6 address in brackets. */
+export const hostAndPort = ({ host, port }) => `${/^[^[]*:/.test(host) ? `[${host}]` : host}:${port}`;
+
 /** Returns whether two descriptions of tags are equal. */
 export const same = (one, other) => JSON.stringify(one) === JSON.stringify(other);

@@ -297,7 +297,7 @@ export class Values {
     const { device } = panel.part;
     const isShown = () => this.panels.includes(panel) && this.device === device;
     const tell = () => say($("outcome"), this.watching && isShown() ? `${told}. The watch continues.`
-      : `${told}: ${cell} of ${device.host}:${device.port}.`);
+      : `${told}: ${cell} of ${parts.hostAndPort(device)}.`);
     if (this.watching || !isShown()) return tell();
     const turn = (this.turn += 1);
     // A watch or another reading back may have begun meanwhile. Its values are newer than these.

@@ -4,7 +4,7 @@ import { notice, post, Problem } from "./api.js";
 import { isPlain, ofTag, ofType, ofWords } from "./write_request.js";
 import { $, h, pause } from "./dom.js";
 import { extent, modicon, REGISTER_FORMS } from "./numbers.js";
-import { placed, same } from "./parts.js";
+import { hostAndPort, placed, same } from "./parts.js";
 import * as reviews from "./review_tables.js";
 
 const BITS_HELP = "0, 1, on or off. Separate values for consecutive coils with semicolons.";
@@ -72,10 +72,9 @@ export class Writer {
     const { part, tag, area, address, ofBits } = target;
     const asked = { ...target, change: null, before: null, looks: 0, waits: 0, sending: null, outcome: null, closing: new AbortController() };
     this.asked = asked;
-    const { host, port, unitId } = part.device;
     const what = ofBits ? "coil" : "holding register";
     $("write-title").textContent = tag ? `Write ${tag.name}` : `Write ${what} ${address}`;
-    $("write-where").textContent = `${tag ? placed(tag) : modicon(area, address)} of unit ${unitId} at ${host}:${port}`;
+    $("write-where").textContent = `${tag ? placed(tag) : modicon(area, address)} of unit ${part.device.unitId} at ${hostAndPort(part.device)}`;
     this.offer(target);
     const states = Object.values(tag?.states ?? {});
     $("write-states").replaceChildren(...states.map((value) => h("option", { value })));
