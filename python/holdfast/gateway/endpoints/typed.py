@@ -92,7 +92,9 @@ class Typed:
 
 def _flaw(value: ConversionError | float) -> str:
     """Why a value is `null` in JSON."""
-    return str(value) if isinstance(value, ConversionError) else f"{value} is not a JSON number"
+    if isinstance(value, ConversionError):
+        return str(value)
+    return "not a number" if value != value else "infinite"
 
 
 def typed(datatype: str | None, order: str, area: Area) -> Typed | None:
