@@ -857,24 +857,25 @@ def test_another_link_is_opened_in_the_same_tab(opened: Opened) -> None:
 
 
 def test_what_is_shown_is_downloaded(opened: Opened, plant: holdfast.Memory) -> None:
-    plant.write("holding_registers", 0, floats(21.5))
+    plant.write("holding_registers", 0, floats(21.5, float("-inf")))
     plant.write("holding_registers", 8, [0x3D31, 0])  # "=1"
     view = connected(opened)
     view.choose(type="float32", quantity="4")
     view.button("Add range to view").click()
     view.choose(address="8", quantity="1", type="string", size="2")
     view.button("Add range to view").click()
-    add_tags(view, METER)
+    add_tags(view, f"{METER}  ratio: {{area: holding_registers, address: 4, unit: '-'}}")
     view.button("Read").click()
     view.says("3 of 3 parts: read in")
     with view.page.expect_download() as found:
         view.button("Download values as CSV").click()
     rows = saved(found.value)
     shown = [(row["name"], row["address"], row["value"], row["unit"], row["state"]) for row in rows]
-    assert shown[:2] == [("", "0", "21.5", "", "current"), ("", "2", "1.013", "", "current")]
+    assert shown[:2] == [("", "0", "21.5", "", "current"), ("", "2", "-inf", "", "current")]
     assert ("", "8", "'=1", "", "current") in shown
     assert ("room", "4", "123.4", "°C", "current") in shown
-    assert "Illegal Data Address" in rows[-1]["error"]
+    assert ("ratio", "4", "1234", "-", "current") in shown
+    assert "Illegal Data Address" in rows[-2]["error"]
     assert all(re.fullmatch(r"\d{4}-\d\d-\d\dT[\d:.]+Z", row["time"]) for row in rows)
 
 

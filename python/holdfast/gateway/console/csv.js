@@ -2,10 +2,13 @@
 
 import { h } from "./dom.js";
 
+/** Returns whether a text that begins with a sign is no formula: a sign alone, or a number. */
+const isData = (text) => /^[-+](inf)?$/.test(text) || Number.isFinite(Number(text));
+
 /** Quotes a cell. Text that a spreadsheet would take for a formula begins with an apostrophe. */
 function cell(value) {
   let text = String(value ?? "");
-  if (/^[=+\-@\t\r]/.test(text) && !Number.isFinite(Number(text))) text = `'${text}`;
+  if (/^[=+\-@\t\r]/.test(text) && !isData(text)) text = `'${text}`;
   return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
 }
 
