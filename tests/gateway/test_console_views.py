@@ -45,6 +45,11 @@ tags:
   alarm: {area: holding_registers, address: 12, type: "bit:4", writable: true}
   lamps: {area: coils, address: 1, type: "bool[2]", writable: true}
 """
+LONG = """\
+tags:
+  energy: {area: holding_registers, address: 20, type: uint64, unit: Wh, writable: true,
+           min: 9007199254740993, max: 18446744073709551615}
+"""
 TANK = TagList([Tag("level", "input_registers", 1002, "int16", unit="mm")])
 WATCHES = 7
 """More tabs than the connections that a browser opens to one host."""
@@ -329,6 +334,14 @@ def test_a_tag_is_written_in_its_unit(opened: Opened, plant: holdfast.Memory) ->
     view.says("Written and read back")
     assert plant.read("holding_registers", 4, 1) == [215]
     expect(tag(view, "room")).to_have_text("21.5")
+
+
+def test_what_a_tag_allows_has_all_digits(opened: Opened) -> None:
+    view = connected(opened)
+    add_tags(view, LONG)
+    view.button("Read").click()
+    view.button("Write energy").click()
+    view.says("In Wh. Allowed: from 9007199254740993 to 18446744073709551615.")
 
 
 def test_a_tag_with_its_scale_in_a_register_offers_no_writing(opened: Opened) -> None:
@@ -877,6 +890,24 @@ def test_what_is_shown_is_downloaded(opened: Opened, plant: holdfast.Memory) -> 
     assert ("ratio", "4", "1234", "-", "current") in shown
     assert "Illegal Data Address" in rows[-2]["error"]
     assert all(re.fullmatch(r"\d{4}-\d\d-\d\dT[\d:.]+Z", row["time"]) for row in rows)
+
+
+def test_downloaded_plots_have_all_digits(opened: Opened, plant: holdfast.Memory) -> None:
+    plant.write("holding_registers", 20, [0x20, 0, 0, 1])
+    view = connected(opened)
+    add_tags(view, LONG)
+    view.choose(interval="50")
+    view.button("Read").click()
+    view.button("Plot energy").click()
+    plot = view.page.get_by_role("article")
+    expect(plot.get_by_role("status")).to_have_text("9007199254740993 Wh")
+    expect(plot.get_by_text("9.0072e+15 … 9.0072e+15")).to_be_visible()
+    plant.write("holding_registers", 23, [0])  # The same as a float.
+    expect(plot.get_by_role("status")).to_have_text("9007199254740992 Wh")
+    view.button("Stop").click()
+    with view.page.expect_download() as found:
+        view.button("Download plots as CSV").click()
+    assert {row["value"] for row in saved(found.value)} == {"9007199254740993", "9007199254740992"}
 
 
 def test_coils_that_were_never_read_have_no_value_in_a_download(opened: Opened) -> None:

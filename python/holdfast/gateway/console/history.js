@@ -8,27 +8,28 @@ const BUCKET = 2;
 const SLACK = 500;
 const MOMENT = 0.001;
 
-/** Points in order of time; a value of null begins a gap. */
+/** Points in order of time, with the texts of their values; a value of null begins a gap. */
 export class History {
   constructor() {
     this.times = [];
     this.values = [];
+    this.texts = [];
     /** When the last value was confirmed. Later, nothing is known. */
     this.until = 0;
     this.compact = SLACK;
   }
 
-  /** Takes the value that was read at a time in seconds. */
-  take(time, value) {
-    if (value !== this.values.at(-1)) this.push(time, value);
+  /** Takes the value that was read at a time in seconds. Its text may have more digits than the number. */
+  take(time, value, text = String(value)) {
+    if (text !== this.texts.at(-1)) this.push(time, value, text);
     this.until = time;
   }
 
   /** Ends the line at the last confirmed value. */
   gap() {
     if (this.values.length === 0 || this.values.at(-1) === null) return;
-    this.push(this.until, this.values.at(-1));
-    this.push(this.until + MOMENT, null);
+    this.push(this.until, this.values.at(-1), this.texts.at(-1));
+    this.push(this.until + MOMENT, null, null);
   }
 
   /** Moves what is known by some seconds. */
@@ -38,9 +39,10 @@ export class History {
     this.until += seconds;
   }
 
-  push(time, value) {
+  push(time, value, text) {
     this.times.push(time);
     this.values.push(value);
+    this.texts.push(text);
     if (this.times.length >= this.compact) {
       this.decimate(time);
       this.compact = this.times.length + SLACK;
@@ -62,13 +64,14 @@ export class History {
     while (at < this.times.length) kept.push(at++);
     this.times = kept.map((each) => this.times[each]);
     this.values = kept.map((each) => this.values[each]);
+    this.texts = kept.map((each) => this.texts[each]);
   }
 
-  /** Returns the points to draw: times, and values with null for gaps. */
+  /** Returns the points to draw: times, and values and their texts with null for gaps. */
   points() {
     const last = this.values.at(-1);
-    if (last === undefined || last === null) return [this.times, this.values];
-    return [[...this.times, this.until], [...this.values, last]];
+    if (last === undefined || last === null) return [this.times, this.values, this.texts];
+    return [[...this.times, this.until], [...this.values, last], [...this.texts, this.texts.at(-1)]];
   }
 
   /** Returns the gaps as pairs of times; the last one may have no end. */

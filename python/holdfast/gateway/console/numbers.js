@@ -131,5 +131,8 @@ export function numeral(text, type) {
   throw new Error(`“${text.trim()}” is not a valid ${type}: ${extent(type)}`);
 }
 
+/** Returns the text of a number, if it has one: numbers of 64 bits have more digits in their text. */
+export const digits = (number, text) => (text && Number(text) === number ? text : String(number));
+
 /** Returns whether a byte order swaps the bytes of each register. */
 export const swapsBytes = (order) => ["BADC", "DCBA"].includes(order);

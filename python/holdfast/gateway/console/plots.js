@@ -142,8 +142,8 @@ export class Plots {
   download() {
     const start = this.now() - this.span;
     const rows = [...this.shown.values()].flatMap((plot) => {
-      const [times, values] = plot.history.points();
-      return times.flatMap((time, at) => (time < start ? [] : [[new Date(1000 * time).toISOString(), plot.label, values[at] ?? ""]]));
+      const [times, , texts] = plot.history.points();
+      return times.flatMap((time, at) => (time < start ? [] : [[new Date(1000 * time).toISOString(), plot.label, texts[at] ?? ""]]));
     });
     save(`plots-${stamp()}.csv`, [["time", "name", "value"], ...rows.sort(([a], [b]) => (a < b ? -1 : Number(a > b)))]);
   }
@@ -187,7 +187,7 @@ class Plot {
       this.gap();
       return;
     }
-    this.history.take(time, value);
+    this.history.take(time, value, this.panel.digits(this.cell));
     this.output.textContent = this.panel.text(this.cell) ?? String(value);
     this.root.classList.remove("old");
     this.describe();
@@ -281,7 +281,12 @@ class Plot {
   }
 }
 
-const shortened = (value) => (Number.isInteger(value) ? String(value) : String(Number(value.toPrecision(5))));
+/** Formats a number with five digits, or an integer with all of them, if a number can have them. */
+function shortened(value) {
+  if (Number.isSafeInteger(value)) return String(value);
+  const text = value.toPrecision(5);
+  return Number.isInteger(value) ? text : String(Number(text));
+}
 
 /** Formats a number for an axis, where space is limited. */
 function short(value) {

@@ -2,7 +2,7 @@
 
 import { notice, post } from "./api.js";
 import { $, h, quiet, table } from "./dom.js";
-import { binary, hex, modicon } from "./numbers.js";
+import { binary, digits, hex, modicon } from "./numbers.js";
 import { Panel } from "./panel.js";
 import { AREAS, areaOf } from "./standard.js";
 
@@ -76,6 +76,11 @@ export class Table extends Panel {
     const { width, ofBits, type } = this.part;
     if (ofBits || at % width !== 0 || type.kind === "string" || type.kind === "bytes") return null;
     return this.texts[at / width] ?? "";
+  }
+
+  /** Returns the number of an address with all its digits. */
+  digits(address) {
+    return digits(this.number(address), this.text(address));
   }
 
   cells() {

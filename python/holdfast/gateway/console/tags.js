@@ -1,6 +1,7 @@
 // The table of the tags of a list.
 
 import { h, quiet } from "./dom.js";
+import { digits } from "./numbers.js";
 import { Panel } from "./panel.js";
 import { functionOf, placed } from "./parts.js";
 
@@ -58,6 +59,11 @@ export class TagTable extends Panel {
   text(name) {
     const index = this.places.get(name);
     return [this.texts[index], this.tags[index].unit].filter(Boolean).join(" ");
+  }
+
+  /** Returns the number of a cell with all its digits. */
+  digits(name) {
+    return digits(this.number(name), this.texts[this.places.get(name)]);
   }
 
   cells() {

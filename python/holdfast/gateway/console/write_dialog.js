@@ -301,9 +301,9 @@ function isRecent(time) {
   return age >= 0 && age <= MAX_AGE_MS;
 }
 
-function tagHelp({ unit, min, max, states, type }) {
+function tagHelp({ unit, minText, maxText, states, type }) {
   const names = Object.values(states);
-  const limits = [min === null ? "" : `from ${min}`, max === null ? "" : `to ${max}`].filter(Boolean).join(" ");
+  const limits = [minText && `from ${minText}`, maxText && `to ${maxText}`].filter(Boolean).join(" ");
   return [
     names.length > 0 ? `One of ${names.join(", ")}.` : valueHelp(type),
     unit ? `In ${unit}.` : "",

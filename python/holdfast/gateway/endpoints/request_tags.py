@@ -18,6 +18,7 @@ from holdfast.runtime.text import listing
 from holdfast.tags.scale import RegisterScale
 from holdfast.tags.text import plain, text_of, value_from
 from holdfast.types import BIT_AREAS
+from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -124,9 +125,18 @@ def described(tag: Tag) -> dict[str, Any]:
         "writable": tag.writable,
         "min": tag.min,
         "max": tag.max,
+        "minText": _limit(tag.min),
+        "maxText": _limit(tag.max),
         "states": {str(value): name for value, name in tag.states.items()},
         "description": tag.description,
     }
+
+
+def _limit(value: float | None) -> str:
+    """A limit as text, because a browser has not all digits of 64 bits; empty for none."""
+    if isinstance(value, float):
+        return shortest(value, "")
+    return "" if value is None else str(value)
 
 
 async def parse(given: Given, profiles: Mapping[str, TagList]) -> Answer:

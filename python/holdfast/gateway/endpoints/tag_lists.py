@@ -48,10 +48,12 @@ TAG = object_of(
         "writable": BOOLEAN,
         "min": NUMBER_OR_NULL,
         "max": NUMBER_OR_NULL,
+        "minText": TEXT,
+        "maxText": TEXT,
         "states": map_of(TEXT),
         "description": TEXT,
     },
-    optional=("scale", "offset", "min", "max", "states", "description"),
+    optional=("scale", "offset", "min", "max", "minText", "maxText", "states", "description"),
 )
 _EXAMPLE = (
     "name,area,address,type,order,scale,offset,unit,writable\nsetpoint,hr,24,uint16,,0.1,,°C,true\n"
