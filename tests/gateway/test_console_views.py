@@ -49,6 +49,7 @@ LONG = """\
 tags:
   energy: {area: holding_registers, address: 20, type: uint64, unit: Wh, writable: true,
            min: 9007199254740993, max: 18446744073709551615}
+  key: {area: holding_registers, address: 24, type: "bytes:3", writable: true}
 """
 TANK = TagList([Tag("level", "input_registers", 1002, "int16", unit="mm")])
 WATCHES = 7
@@ -342,6 +343,9 @@ def test_what_a_tag_allows_has_all_digits(opened: Opened) -> None:
     view.button("Read").click()
     view.button("Write energy").click()
     view.says("In Wh. Allowed: from 9007199254740993 to 18446744073709551615.")
+    view.button("Cancel").click()
+    view.button("Write key").click()
+    view.says("3 bytes in base64")
 
 
 def test_a_tag_with_its_scale_in_a_register_offers_no_writing(opened: Opened) -> None:

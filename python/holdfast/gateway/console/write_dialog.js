@@ -314,6 +314,7 @@ function tagHelp({ unit, minText, maxText, states, type }) {
 function valueHelp(type) {
   if (type.includes("[")) return "A list in JSON, as in [1, 2].";
   if (type.startsWith("string")) return "Text.";
+  if (type.startsWith("bytes")) return `${type.split(":")[1]} bytes in base64, as in the table.`;
   return type === "bool" || type.startsWith("bit") ? "0, 1, on or off." : "A number, with a decimal point.";
 }
 
