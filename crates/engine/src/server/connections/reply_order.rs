@@ -132,7 +132,10 @@ impl Deferred {
             Some(place @ Elsewhere::Mirror(_)) if self.is_empty() => place,
             Some(place @ (Elsewhere::Device(_) | Elsewhere::Journal(_)))
                 if self.has_room()
-                    && self.waiting.iter().all(|other| other.answered_by == discriminant(place)) =>
+                    && self
+                        .waiting
+                        .iter()
+                        .all(|other| other.answered_by == discriminant(place)) =>
             {
                 place
             }
