@@ -1471,11 +1471,16 @@ class Link:
         timeout: float,
         *,
         broadcast: bool = False,
+        peers: Sequence[str] | None = None,
     ) -> int | None:
         """Sends a request when its turn comes; its ticket in `Caller.take`.
 
         `timeout` is in seconds and includes the wait for the turn. A `broadcast` has no reply: it
         ends when the devices had time to carry it out. Returns `None` when the queue is full.
+
+        With `peers`, addresses, the request is sent only on a connection to one of them. If there
+        is another connection, or the device's name has none of them, the call ends with the result
+        `PermissionError`.
         """
 
     def counters(self) -> dict[str, int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ import pytest
 from holdfast.config import load
 from support import wire
 from support.fake_device import HANG_UP, FakeDevice, Stream, exception, silent
+from support.machine import needs_127_0_0_2
 from support.routed import Held, await_count, counters
 from support.running import endpoint
 from support.shared import Careful, ask, polled, read, unanswered, with_gateway
@@ -86,6 +88,55 @@ def test_a_device_that_is_configured_by_its_name_is_shared_when_asked_by_it(run:
         body = {"host": "localhost", "functionCode": 3, "address": 7}
         assert ask(appliance, "/read", device.port, **body).json["values"] == [7]
     assert device.connections == 1
+
+
+@pytest.fixture
+def moved(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
+    """When called, lets the gateway find another address of `localhost` than the appliance."""
+    real = socket.getaddrinfo
+
+    def elsewhere(host: Any, *arguments: Any, **options: Any) -> Any:
+        return real("127.0.0.2" if host == "localhost" else host, *arguments, **options)
+
+    return lambda: monkeypatch.setattr(socket, "getaddrinfo", elsewhere)
+
+
+@needs_127_0_0_2
+@pytest.mark.parametrize("is_polled", [True, False])
+@pytest.mark.parametrize("kind", ["tcp", "rtu+tcp"])
+def test_a_connection_by_name_to_another_address_is_not_taken(
+    run: Run, moved: Callable[[], None], kind: str, is_polled: bool
+) -> None:
+    with Stream(kind, in_turn=True) as device:
+        url = f"{kind}://localhost:{device.port}"
+        appliance = run(with_gateway(url, **(polled(url) if is_polled else {})))
+        wire.until(lambda: device.requests or not is_polled, "it is polled")
+        moved()
+        body = {"host": "localhost", "transport": kind, "address": 7, "value": 1}
+        answer = ask(appliance, "/write/register", device.port, **body)
+        assert failure(answer)[:2] == (500, "no_connection")
+    assert {asked.pdu[0] for asked in device.requests} == ({3} if is_polled else set())
+    assert device.connections == is_polled
+
+
+@needs_127_0_0_2
+def test_an_equal_read_over_a_connection_to_another_address_is_not_shared(
+    run: Run, connect: Connect, threads: ThreadPoolExecutor, moved: Callable[[], None]
+) -> None:
+    held = Held()
+    with Stream("tcp", held) as device:
+        appliance = run(with_gateway(f"tcp://localhost:{device.port}"))
+        fronts = [connect(endpoint(appliance, "scada")) for _ in range(2)]
+        first = threads.submit(fronts[0].ask, bytes.fromhex("0300640001"))
+        device.await_requests(1)
+        routed = threads.submit(fronts[1].ask, READ)
+        await_count(appliance, "waiting", 2)
+        moved()
+        named = threads.submit(read, appliance, device.port, 5, host="localhost")
+        await_count(appliance, "waiting", 3)
+        held.release()
+        assert failure(named.result())[:2] == (500, "no_connection")
+        assert (first.result()[2:], routed.result()[2:]) == (b"\0\x64", b"\0\5")
 
 
 def test_all_writes_take_the_shared_connection(run: Run) -> None:

@@ -18,7 +18,7 @@ use holdfast_protocol::pdu::{
     self, Bits, Diagnostics, EncodedRequest, ExceptionCode, FileRange, FileRanges, FileRecords,
     Range, Registers, Request as CoreRequest, RequestError, Response, SubFunction, limit,
 };
-use pyo3::exceptions::{PyException, PyOSError, PyRuntimeError, PyValueError};
+use pyo3::exceptions::{PyException, PyOSError, PyPermissionError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyList};
 use pyo3::{PyTraverseError, PyVisit};
@@ -586,6 +586,7 @@ pub(crate) fn to_py_err(error: &ClientError) -> PyErr {
         ClientError::Lost(_) | ClientError::Fenced | ClientError::Expired => {
             ConnectionLost::new_err(text)
         }
+        ClientError::Elsewhere => PyPermissionError::new_err(text),
         ClientError::Invalid(invalid) => InvalidResponse::new_err((text, invalid.reason())),
     }
 }

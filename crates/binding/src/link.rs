@@ -4,7 +4,7 @@ use std::net::IpAddr;
 use std::sync::{Arc, Mutex};
 
 use holdfast_engine::Wakes;
-use holdfast_engine::client::StrayCounters;
+use holdfast_engine::client::{Peers, StrayCounters};
 use holdfast_engine::link::{
     Caller as CoreCaller, InFlight, LinkSettings, Route as CoreRoute, SharedLink,
     Withdrawal as CoreWithdrawal,
@@ -101,7 +101,8 @@ impl Link {
         Ok(())
     }
 
-    #[pyo3(signature = (caller, request, unit, timeout, *, broadcast=false))]
+    #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
+    #[pyo3(signature = (caller, request, unit, timeout, *, broadcast=false, peers=None))]
     fn call(
         &self,
         caller: PyRef<'_, Caller>,
@@ -109,9 +110,13 @@ impl Link {
         unit: i128,
         timeout: f64,
         broadcast: bool,
+        peers: Option<Vec<String>>,
     ) -> PyResult<Option<u64>> {
         let (unit_id, timeout) = (byte("unit", unit)?, seconds("timeout", timeout)?);
-        Ok(self.core.call(&caller.core, unit_id, &request.encoded, timeout, broadcast))
+        let peers = peers.map_or_else(Peers::default, |all| {
+            Peers::only(all.iter().filter_map(|each| each.parse::<IpAddr>().ok()))
+        });
+        Ok(self.core.call(&caller.core, unit_id, &request.encoded, timeout, broadcast, peers))
     }
 
     #[getter]

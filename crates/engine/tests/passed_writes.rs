@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use holdfast_engine::client::Place;
+use holdfast_engine::client::{Peers, Place};
 use holdfast_engine::link::{Caller, Fault, InFlight, LinkSettings};
 use holdfast_engine::poller::plan::{PlanLimits, Strategy};
 use holdfast_engine::poller::{
@@ -265,7 +265,8 @@ fn a_write_that_waits_through_a_standstill_is_not_sent() {
     let write = Request::WriteSingleRegister { address: 3, value: 7 };
     let read = Request::ReadHoldingRegisters(Range::new(0, 5).unwrap());
     let call = |request: &Request<'_>| {
-        link.call(&caller, 1, &EncodedRequest::new(request), TIMEOUT, false).unwrap()
+        link.call(&caller, 1, &EncodedRequest::new(request), TIMEOUT, false, Peers::default())
+            .unwrap()
     };
     let sent = passage.call(&caller, &write);
     asked.recv_timeout(TIMEOUT).expect("the device has the write");

@@ -30,9 +30,15 @@ class Route:
     """How a device is reached."""
 
     named: NetworkTarget
-    """The host as in the request. A name is a target of the appliance only."""
+    """The host as in the request. A name is a target of the appliance only, whose connection to it
+    must lead to one of `allowed`."""
     allowed: tuple[NetworkTarget, ...]
     """The addresses that the gateway may connect to, which were checked."""
+
+    @property
+    def addresses(self) -> tuple[str, ...]:
+        """The hosts of `allowed`."""
+        return tuple(each.host for each in self.allowed)
 
 
 class DeviceRoutes:

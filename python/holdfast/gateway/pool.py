@@ -23,7 +23,7 @@ from holdfast.client.endpoint import check_files
 from holdfast.client.url import IN_FLIGHT, NetworkTarget
 from holdfast.errors import ConnectionLost, ModbusException, RequestTimeout
 from holdfast.gateway.broadcast import is_broadcast, send
-from holdfast.gateway.shared_devices import Turns
+from holdfast.gateway.shared_devices import Elsewhere, Turns
 from holdfast.gateway.shared_reads import WaitingRequests
 from holdfast.net.http.requests import BadRequest
 from holdfast.net.tls import NO_FILES
@@ -155,7 +155,8 @@ class Pool:
     ) -> Result:
         """Runs a call on the connection to a device, trying its addresses in turn.
 
-        The connection is that of the appliance, if it uses the host or one of the addresses.
+        The connection is that of the appliance, if it uses the host or one of the addresses, and
+        the connection leads to one of them.
 
         `timeout` is in seconds; the caller must cancel the call when it expires. Raises
         `BadRequest` if all connections are in use, `Unusable`, `ValueError` for an invalid
@@ -165,9 +166,12 @@ class Pool:
             self._keeper = asyncio.create_task(self._keep())
         if self._shared is not None:
             for target in dict.fromkeys((route.named, *route.allowed)):
-                turns = await self._shared.turns(target, timeout)
+                # A connection by the name may have been made to any address of the name.
+                peers = None if target in route.allowed else route.addresses
+                turns = await self._shared.turns(target, timeout, peers)
                 if turns is not None:
-                    return await call(turns)
+                    with contextlib.suppress(Elsewhere):
+                        return await call(turns)
         *earlier, last = sorted(route.allowed, key=lambda each: each not in self._entries)
         for target in earlier:
             try:

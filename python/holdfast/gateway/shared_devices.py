@@ -35,8 +35,15 @@ MIN_TIMEOUT_S = 0.001
 """The shortest timeout of a request."""
 
 
+MOVED = "connection lost: the next one would lead to an address that is not allowed"
+
+
 class QueueFull(Exception):
     """Too many requests wait for the connection."""
+
+
+class Elsewhere(Exception):
+    """The connection leads to an address that the request may not reach. Nothing was sent."""
 
 
 class Shared:
@@ -51,9 +58,12 @@ class Shared:
         self._calls: Calls | None = None
         self._opening = asyncio.Lock()
 
-    async def turns(self, target: NetworkTarget, timeout: float) -> Turns | None:
+    async def turns(
+        self, target: NetworkTarget, timeout: float, peers: tuple[str, ...] | None
+    ) -> Turns | None:
         """Returns the turns of requests within `timeout` seconds from now.
 
+        If the host is a name, `peers` are the addresses that the requests may reach.
         Returns `None` if the appliance does not use the address, or with other certificates.
         """
         if target.transport == "tls" and target not in self._endpoints:
@@ -67,7 +77,7 @@ class Shared:
         if self._calls is None:
             async with self._opening:
                 self._calls = self._calls or await Calls.opened()
-        return _LinkTurns(target, self._calls, link, timeout)
+        return _LinkTurns(target, self._calls, link, timeout, peers)
 
     def knows(self, target: NetworkTarget) -> bool:
         """Returns whether the appliance uses this address."""
@@ -123,8 +133,9 @@ class Turns:
         """Whether the device may have received a request."""
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
-        """Sends a request when its turn comes. Raises `QueueFull` and the errors of a client.
+        """Sends a request when its turn comes. Raises the errors of a client.
 
+        Raises also `QueueFull`, and `Elsewhere` unless an earlier request was sent.
         A `ConnectionLost` is of all requests of this caller: one before may have been sent.
         """
         raise NotImplementedError
@@ -136,16 +147,26 @@ class Turns:
 class _LinkTurns(Turns):
     """Turns on a link of the appliance, within `timeout` seconds from now."""
 
-    def __init__(self, target: NetworkTarget, calls: Calls, link: Link, timeout: float) -> None:
+    def __init__(
+        self,
+        target: NetworkTarget,
+        calls: Calls,
+        link: Link,
+        timeout: float,
+        peers: tuple[str, ...] | None,
+    ) -> None:
         super().__init__(target)
         self._calls = calls
         self._link = link
+        self._peers = peers
         self._deadline = time.monotonic() + timeout
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
         left = max(min(self._deadline - time.monotonic(), timeout), MIN_TIMEOUT_S)
         broadcast = is_broadcast(self.target.transport, unit)
-        ticket = self._link.call(self._calls.caller, request, unit, left, broadcast=broadcast)
+        ticket = self._link.call(
+            self._calls.caller, request, unit, left, broadcast=broadcast, peers=self._peers
+        )
         if ticket is None:
             raise QueueFull
         answer = self._calls.result(ticket)
@@ -154,6 +175,10 @@ class _LinkTurns(Turns):
         except asyncio.CancelledError:
             self.is_sent |= self._calls.give_up(ticket, answer)
             raise
+        if isinstance(result, PermissionError):
+            if not self.is_sent:
+                raise Elsewhere
+            result = ConnectionLost(MOVED)
         if isinstance(result, ConnectionLost | RequestTimeout):
             sent = result.maybe_sent = self.is_sent or (sent and result.maybe_sent)
         self.is_sent |= sent

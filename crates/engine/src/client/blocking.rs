@@ -4,6 +4,7 @@
 //! sent again.
 
 use std::io::ErrorKind;
+use std::net::IpAddr;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{self, RecvTimeoutError};
 use std::sync::{Arc, Mutex};
@@ -19,7 +20,7 @@ use super::connect::connect;
 use super::fair_lock::Turns;
 use super::interrupt::{Interrupt, SIGNAL_CHECK_INTERVAL};
 use super::trace::{Trace, Traced};
-use super::{ClientError, Endpoint, Lost, Place, StrayCounters, connection};
+use super::{ClientError, Endpoint, Lost, Peers, Place, StrayCounters, connection};
 
 /// Bytes per read of a socket. No Modbus datagram is longer.
 const CHUNK_BYTES: usize = 512;
@@ -57,6 +58,7 @@ struct State {
 /// An open connection.
 struct Open {
     stream: Box<dyn ByteStream>,
+    peer: Option<IpAddr>,
     connection: Connection,
     transport: Transport,
     /// The zero of the clock of the connection.
@@ -86,6 +88,7 @@ pub struct Conditions<'c> {
     /// Asked before bytes are sent, and then at most every 0.1 s. If it is false, the connection is
     /// closed.
     pub may_continue: Option<&'c dyn Fn() -> bool>,
+    pub peers: Peers,
 }
 
 impl Conditions<'_> {
@@ -126,7 +129,7 @@ impl BlockingClient {
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Option<Result<T, ClientError>> {
         let interrupt = Interrupt::new(Some(interrupted));
-        let conditions = &Conditions { may_send, may_continue: None };
+        let conditions = &Conditions { may_send, may_continue: None, peers: Peers::default() };
         let attempt = Attempt::default();
         let call = Call { unit_id, request, attempt, conditions, was_sent, refused: None };
         self.call_unless(interrupt, call, timeout, take)
@@ -181,8 +184,10 @@ impl BlockingClient {
                 }
                 return Some(Err(error));
             }
-            let open = match self.connected(&mut state, deadline, timeout, interrupt)? {
-                Ok(open) => open,
+            let peers = &conditions.peers;
+            let open = match self.connected(&mut state, peers, deadline, timeout, interrupt)? {
+                Ok(open) if peers.hold(open.peer) => open,
+                Ok(_) => return Some(Err(ClientError::Elsewhere)),
                 Err(error) => return Some(Err(error)),
             };
             let late = open.connection.late();
@@ -241,6 +246,7 @@ impl BlockingClient {
     fn connected<'s>(
         &self,
         state: &'s mut State,
+        peers: &Peers,
         deadline: Instant,
         timeout: Duration,
         interrupt: &mut Interrupt<'_>,
@@ -256,7 +262,7 @@ impl BlockingClient {
             if let Some(from) = from.filter(|from| *from > Instant::now()) {
                 interrupt.sleep_until(from.min(deadline));
             }
-            match self.open(deadline, timeout, interrupt) {
+            match self.open(peers, deadline, timeout, interrupt) {
                 Some(Ok(mut open)) => {
                     if let Some(trace) = &self.trace {
                         let trace = Arc::clone(trace);
@@ -280,6 +286,7 @@ impl BlockingClient {
     /// nor a connect can be ended early, only left behind.
     fn open(
         &self,
+        peers: &Peers,
         deadline: Instant,
         timeout: Duration,
         interrupt: &mut Interrupt<'_>,
@@ -287,15 +294,15 @@ impl BlockingClient {
         if interrupt.is_hit() {
             return None;
         }
-        let (endpoint, epoch) = (self.endpoint.clone(), self.epoch);
+        let (endpoint, epoch, own) = (self.endpoint.clone(), self.epoch, peers.clone());
         let (sender, opened) = mpsc::sync_channel(1);
         let work = move || {
             // Fails if the caller was interrupted.
-            let _ = sender.send(Open::new(&endpoint, epoch, deadline, timeout));
+            let _ = sender.send(Open::new(&endpoint, epoch, &own, deadline, timeout));
         };
         let connecting = thread::Builder::new().name("holdfast-connect".into());
         if !interrupt.is_possible() || connecting.spawn(work).is_err() {
-            return Some(Open::new(&self.endpoint, self.epoch, deadline, timeout));
+            return Some(Open::new(&self.endpoint, self.epoch, peers, deadline, timeout));
         }
         loop {
             match opened.recv_timeout(SIGNAL_CHECK_INTERVAL) {
@@ -315,7 +322,9 @@ impl BlockingClient {
             }
             StreamError::Io(error) => Lost::Io(error),
             StreamError::TimedOut | StreamError::Ended => Lost::Closed(Closed::ByPeer),
-            StreamError::Unresolved => unreachable!("an open connection needs no lookup"),
+            StreamError::Unresolved | StreamError::Elsewhere => {
+                unreachable!("an open connection needs no lookup")
+            }
         })
     }
 
@@ -366,14 +375,16 @@ impl Open {
     fn new(
         endpoint: &Endpoint,
         epoch: Epoch,
+        peers: &Peers,
         deadline: Instant,
         timeout: Duration,
     ) -> Result<Open, ClientError> {
         let transport = endpoint.place.transport();
         let to = || endpoint.to_string();
-        let stream = connect(&endpoint.place, deadline).map_err(|error| match error {
+        let stream = connect(&endpoint.place, peers, deadline).map_err(|error| match error {
             StreamError::TimedOut => ClientError::ConnectTimeout { to: to(), after: timeout },
             StreamError::Unresolved => ClientError::LookupTimeout { to: to(), after: timeout },
+            StreamError::Elsewhere => ClientError::Elsewhere,
             StreamError::Ended => {
                 ClientError::Connect { to: to(), error: ErrorKind::UnexpectedEof.into() }
             }
@@ -386,7 +397,8 @@ impl Open {
             Place::Serial(line) => connection.on_line(line.character()),
             _ => connection,
         };
-        Ok(Open { stream, connection, transport, epoch, used: now, late: 0 })
+        let peer = stream.peer();
+        Ok(Open { stream, peer, connection, transport, epoch, used: now, late: 0 })
     }
 
     /// Whether the connection can carry another request: the peer has not closed it, and has not
@@ -542,7 +554,9 @@ mod tests {
 
     use super::*;
 
-    const ANY_TIME: Conditions<'static> = Conditions { may_send: &|_| Ok(()), may_continue: None };
+    fn any_time() -> Conditions<'static> {
+        Conditions { may_send: &|_| Ok(()), may_continue: None, peers: Peers::default() }
+    }
 
     /// A stream whose second copy of a reply waits unread when the guard time is over, because the process had no
     /// processor.
@@ -585,6 +599,7 @@ mod tests {
         let client = BlockingClient::new(Endpoint { place, tolerance: Tolerance::default() });
         client.state.lock().unwrap().open = Some(Open {
             stream: Box::new(Stalled { waiting: VecDeque::new(), copy: None }),
+            peer: None,
             connection: Connection::new(Transport::RtuOverTcp),
             transport: Transport::RtuOverTcp,
             epoch: client.epoch,
@@ -595,7 +610,7 @@ mod tests {
             let range = Range::new(address, 1).unwrap();
             let request = EncodedRequest::new(&Request::ReadHoldingRegisters(range));
             let timeout = Duration::from_secs(60);
-            let pdu = client.call(&ANY_TIME, 1, &request, timeout, |_, pdu| pdu.to_vec());
+            let pdu = client.call(&any_time(), 1, &request, timeout, |_, pdu| pdu.to_vec());
             assert_eq!(pdu.unwrap(), [3, 2, 0, address as u8]);
         }
     }
@@ -614,13 +629,14 @@ mod tests {
         }
         client.state.lock().unwrap().open = Some(Open {
             stream: Box::new(Stalled { waiting: VecDeque::new(), copy: None }),
+            peer: None,
             connection,
             transport: Transport::Tcp,
             epoch: client.epoch,
             used: Instant::now(),
             late: 0,
         });
-        let answer = client.call(&ANY_TIME, 1, &request, timeout, |_, _| ());
+        let answer = client.call(&any_time(), 1, &request, timeout, |_, _| ());
         let expected = Lost::Closed(Closed::NoTransactionId);
         assert!(
             matches!(&answer, Err(ClientError::Lost(why)) if why.to_string() == expected.to_string())
@@ -646,6 +662,7 @@ mod tests {
         connection.advance(now + TURNAROUND, |_| {});
         client.state.lock().unwrap().open = Some(Open {
             stream: Box::new(Stalled { waiting: VecDeque::new(), copy: None }),
+            peer: None,
             connection,
             transport,
             epoch: client.epoch,
@@ -657,12 +674,12 @@ mod tests {
             asked.set(asked.get() + 1);
             if is_sent || asked.get() > 3 { Err(ClientError::Expired) } else { Ok(()) }
         };
-        let conditions = Conditions { may_send: &may_send, may_continue: None };
+        let conditions = Conditions { may_send: &may_send, ..any_time() };
         let answer = client.call(&conditions, 1, &write, timeout, |_, _| ());
         assert!(matches!(answer, Err(ClientError::Expired)), "{answer:?}");
         assert_eq!(asked.get(), 4);
         assert!(client.state.lock().unwrap().open.is_some());
-        let answer = client.call(&ANY_TIME, 2, &request, timeout, |_, pdu| pdu.to_vec());
+        let answer = client.call(&any_time(), 2, &request, timeout, |_, pdu| pdu.to_vec());
         assert_eq!(answer.unwrap(), [3, 2, 0, 0]);
     }
 
@@ -673,7 +690,7 @@ mod tests {
         let place = Place::Tcp { host, port, tls: None };
         let client = BlockingClient::new(Endpoint { place, tolerance: Tolerance::default() });
         let may_send = |is_sent| if is_sent { Err(ClientError::Expired) } else { Ok(()) };
-        let conditions = Conditions { may_send: &may_send, may_continue: None };
+        let conditions = Conditions { may_send: &may_send, ..any_time() };
         let write = EncodedRequest::new(&Request::WriteSingleRegister { address: 0, value: 1 });
         let answer = client.call(&conditions, 1, &write, Duration::from_secs(60), |_, _| ());
         assert!(matches!(answer, Err(ClientError::Expired)), "{answer:?}");

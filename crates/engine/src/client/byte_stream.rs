@@ -1,11 +1,12 @@
 //! Byte streams with deadlines: a TCP connection, datagrams, a serial port.
 
 use std::io::{self, ErrorKind, Read, Write};
-use std::net::{SocketAddr, TcpStream, UdpSocket};
+use std::net::{IpAddr, SocketAddr, TcpStream, UdpSocket};
 use std::time::{Duration, Instant};
 
 use socket2::SockRef;
 
+use crate::client::Peers;
 use crate::name_lookup::{self, Unresolved};
 use crate::serial_line::OpenLine;
 use crate::socket_calls::ResendLimit;
@@ -21,6 +22,8 @@ pub(super) enum StreamError {
     TimedOut,
     /// The deadline passed while the name was looked up.
     Unresolved,
+    /// The name leads to none of the [`Peers`].
+    Elsewhere,
     /// The peer has ended the stream.
     Ended,
     Io(io::Error),
@@ -45,6 +48,11 @@ pub(super) trait ByteStream: Send {
     /// Whether the stream is that of another device than its name is now.
     fn has_moved(&self) -> bool {
         false
+    }
+
+    /// The address at the other end, if it has one.
+    fn peer(&self) -> Option<IpAddr> {
+        None
     }
 
     /// Whether the stream is open and no bytes wait in it.
@@ -119,9 +127,10 @@ impl TcpByteStream {
     pub(super) fn connect(
         host: &str,
         port: u16,
+        peers: &Peers,
         deadline: Instant,
     ) -> Result<TcpByteStream, StreamError> {
-        let found = name_lookup::addresses(host, port, deadline)?;
+        let found = addresses(host, port, peers, deadline)?;
         let socket = first(found, |address, others| {
             let timeout = left(deadline)?.min(name_lookup::share(deadline, others));
             TcpStream::connect_timeout(&address, timeout.max(MIN_TIMEOUT))
@@ -184,6 +193,10 @@ impl ByteStream for TcpByteStream {
         }
     }
 
+    fn peer(&self) -> Option<IpAddr> {
+        self.socket.peer_addr().ok().map(|peer| peer.ip())
+    }
+
     fn is_quiet(&self) -> bool {
         self.peek().is_err_and(|error| error.kind() == ErrorKind::WouldBlock)
     }
@@ -193,9 +206,10 @@ impl ByteStream for TcpByteStream {
 pub(super) fn connect_udp(
     host: &str,
     port: u16,
+    peers: &Peers,
     deadline: Instant,
 ) -> Result<UdpSocket, StreamError> {
-    let found = name_lookup::addresses(host, port, deadline)?;
+    let found = addresses(host, port, peers, deadline)?;
     Ok(first(found, |address, _| {
         let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
         let socket = UdpSocket::bind(any)?;
@@ -225,6 +239,10 @@ impl ByteStream for UdpSocket {
     fn send(&mut self, bytes: &[u8], _deadline: Instant) -> Result<(), StreamError> {
         UdpSocket::send(self, bytes)?;
         Ok(())
+    }
+
+    fn peer(&self) -> Option<IpAddr> {
+        self.peer_addr().ok().map(|peer| peer.ip())
     }
 
     fn is_quiet(&self) -> bool {
@@ -260,6 +278,17 @@ impl ByteStream for OpenLine<serial2::SerialPort> {
     fn has_moved(&self) -> bool {
         OpenLine::has_moved(self)
     }
+}
+
+/// The addresses of a name that are among the `peers`.
+fn addresses(
+    host: &str,
+    port: u16,
+    peers: &Peers,
+    deadline: Instant,
+) -> Result<Vec<SocketAddr>, StreamError> {
+    let found = name_lookup::addresses(host, port, deadline)?;
+    peers.among(found).ok_or(StreamError::Elsewhere)
 }
 
 /// Tries the addresses of a name in order, until `open` succeeds. It also gets the number of addresses that
@@ -306,7 +335,8 @@ mod tests {
     fn the_system_repeats_no_request_for_much_longer_than_its_timeout() {
         let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
         let (port, deadline) = (listener.local_addr().unwrap().port(), Instant::now() + MINUTE);
-        let mut stream = TcpByteStream::connect("127.0.0.1", port, deadline).unwrap();
+        let mut stream =
+            TcpByteStream::connect("127.0.0.1", port, &Peers::default(), deadline).unwrap();
         stream.send(&[0], deadline).unwrap();
         let limit = SockRef::from(&stream.socket).tcp_user_timeout().unwrap();
         assert!(limit.is_some_and(|limit| !limit.is_zero() && limit <= MINUTE), "{limit:?}");

@@ -9,12 +9,14 @@ mod connect;
 mod endpoint;
 mod fair_lock;
 mod interrupt;
+mod peers;
 mod stray_counts;
 mod tls_stream;
 mod trace;
 
 pub use blocking::{BlockingClient, Conditions};
 pub use endpoint::{Endpoint, Place};
+pub use peers::Peers;
 pub use stray_counts::StrayCounters;
 pub use trace::{Direction, Trace};
 
@@ -74,6 +76,9 @@ pub enum ClientError {
     /// The request was not sent in time. Nothing was sent.
     #[error("not sent: it has waited too long")]
     Expired,
+    /// The connection leads to none of the [`Peers`] of the request. Nothing was sent.
+    #[error("not sent: the connection leads to another address")]
+    Elsewhere,
 }
 
 /// Why a connection was lost.

@@ -1,6 +1,7 @@
 //! TLS over a TCP connection with deadlines.
 
 use std::io::{ErrorKind, Write};
+use std::net::IpAddr;
 use std::time::Instant;
 
 use super::byte_stream::{ByteStream, StreamError, TcpByteStream};
@@ -167,6 +168,10 @@ impl ByteStream for TlsStream {
     fn has_ended(&mut self) -> bool {
         let ended = self.read_available();
         ended || self.broken.is_some() || self.channel.has_ended()
+    }
+
+    fn peer(&self) -> Option<IpAddr> {
+        self.stream.peer()
     }
 
     fn is_quiet(&self) -> bool {

@@ -135,7 +135,7 @@ pub(crate) fn fault(error: &ClientError) -> Fault {
         ClientError::Invalid(InvalidResponse::Flood) => Fault::Flooded,
         ClientError::Invalid(_) => Fault::Invalid,
         ClientError::Fenced => Fault::Standby,
-        ClientError::Expired => Fault::Expired,
+        ClientError::Expired | ClientError::Elsewhere => Fault::Expired,
         ClientError::Lost(_) | ClientError::Tls { .. } => Fault::Reset,
     }
 }

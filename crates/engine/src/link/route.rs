@@ -13,7 +13,7 @@ use tokio::sync::mpsc;
 
 use super::caller::{Caller, Waiting};
 use super::fault::exception_in;
-use crate::client::{self, ClientError, Endpoint, StrayCounters};
+use crate::client::{self, ClientError, Endpoint, Peers, StrayCounters};
 use crate::counter::counters;
 use crate::link::limits::permit::Wanted;
 use crate::link::limits::queue_share::{Place, QueueShare, Source};
@@ -118,6 +118,8 @@ pub(super) struct Reply {
     /// The longest time that it may take after the request was sent. Event loops wait as long as the most
     /// patient route of the link.
     pub(super) longest_wait: Duration,
+    /// Where the request may be sent.
+    pub(super) peers: Peers,
     /// What its connection asks for after it waits for its end.
     in_order: Option<InOrder>,
     /// Of its route; `None` for an event loop.
@@ -223,7 +225,8 @@ impl SharedLink {
     }
 
     /// Sends a request of an event loop on its way. `timeout` includes the wait for the turn. A
-    /// broadcast ends without a reply. Returns the ticket of the call; `None` when the queue is full.
+    /// broadcast ends without a reply. If the connection leads to none of the `peers`, it ends as
+    /// [`ClientError::Elsewhere`]. Returns the ticket of the call; `None` when the queue is full.
     pub fn call(
         &self,
         caller: &Arc<Caller>,
@@ -231,6 +234,7 @@ impl SharedLink {
         request: &EncodedRequest,
         timeout: Duration,
         is_broadcast: bool,
+        peers: Peers,
     ) -> Option<u64> {
         self.counters.requests.add();
         let place = self.admitted(self.queue.place(Source::EventLoops))?;
@@ -242,7 +246,8 @@ impl SharedLink {
         let longest_wait = self.longest_wait();
         let to = Receiver::EventLoop(waiting.at_most(longest_wait));
         let (request, queued, source) = (request.clone(), time_since_boot(), caller.source);
-        let reply = Reply { to, longest_wait, in_order: None, withdrawal: None, _place: place };
+        let reply =
+            Reply { to, longest_wait, peers, in_order: None, withdrawal: None, _place: place };
         // If the link has ended, the call ends as lost.
         let _ = self.calls.send(Call { unit_id, request, queued, source, priority, reply });
         Some(ticket)
@@ -292,6 +297,7 @@ impl Route {
             reply: Reply {
                 to: Receiver::Client(to),
                 longest_wait: self.timeout,
+                peers: Peers::default(),
                 in_order: None,
                 withdrawal: Some(Arc::clone(&self.withdrawal)),
                 _place: place,

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use tokio::time::timeout_at;
 
-use crate::client::ClientError;
+use crate::client::{ClientError, Peers};
 use crate::link::limits::lease_fence::Fence;
 
 /// Whether somebody still waits for the answer to a request. Called with true when it is sent now.
@@ -20,6 +20,7 @@ pub(crate) struct Permit {
     pub until: Option<Instant>,
     /// `None` if it is sent even when nobody waits for its answer.
     pub wanted: Option<Wanted>,
+    pub peers: Peers,
 }
 
 impl Permit {

@@ -74,6 +74,7 @@ impl Serving {
             return;
         };
         let client_gone = reply.client_gone();
+        let peers = reply.peers.clone();
         let joining = self.reads.join(read.clone(), reply);
         if joining.follows_equal {
             counters.coalesced.add();
@@ -111,11 +112,11 @@ impl Serving {
             true => Permit::default(),
             false => Permit::default().and(standstill::none_since(queued)),
         };
-        let permit = permit.and(wanted);
+        let permit = Permit { peers, ..permit.and(wanted) };
         let answered = self.link.exchange(unit_id, &request, timeout, true, &permit).await;
         drop(turn);
         if let Err(error) = &answered
-            && matches!(**error, ClientError::Expired)
+            && matches!(**error, ClientError::Expired | ClientError::Elsewhere)
         {
             counters.withdrawn.add();
             // After a standstill, or without its device, a caller may still be there.

@@ -10,6 +10,7 @@ use holdfast_protocol::pdu::EncodedRequest;
 use holdfast_runtime::time_since_boot;
 use tokio::sync::Notify;
 
+use crate::client::Peers;
 use crate::link::route::Reply;
 
 /// The most replies that are kept for equal reads.
@@ -20,7 +21,7 @@ pub(in crate::link) struct SharedReads {
     coalesce: bool,
     /// How long a reply answers equal reads.
     keep: Duration,
-    /// By their timeouts too: none waits longer than its own.
+    /// By their timeouts too, as none waits longer than its own, and by where they may be sent.
     waiting: RefCell<HashMap<WaitingKey, Rc<EqualReads>>>,
     cached: RefCell<HashMap<ReadKey, Cached>>,
 }
@@ -28,7 +29,7 @@ pub(in crate::link) struct SharedReads {
 /// A read that equal ones can share a reply with: its unit id and PDU.
 pub(in crate::link) type ReadKey = (u8, Box<[u8]>);
 
-type WaitingKey = (ReadKey, Duration);
+type WaitingKey = (ReadKey, Duration, Peers);
 
 /// Equal reads. Each waits for a turn of its own, so that none waits longer than without the others; the
 /// first to have it is sent for all.
@@ -59,7 +60,8 @@ impl SharedReads {
 
     /// Lets a request wait with equal reads, if it is a read.
     pub(in crate::link) fn join(&self, read: Option<ReadKey>, reply: Reply) -> Joining<'_> {
-        let read = read.filter(|_| self.coalesce).map(|read| (read, reply.longest_wait));
+        let read = read.filter(|_| self.coalesce);
+        let read = read.map(|read| (read, reply.longest_wait, reply.peers.clone()));
         let equal = match &read {
             Some(read) => Rc::clone(self.waiting.borrow_mut().entry(read.clone()).or_default()),
             None => Rc::default(),

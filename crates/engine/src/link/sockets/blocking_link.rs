@@ -132,6 +132,7 @@ fn carried_out(client: &BlockingClient, call: &Call, pause: &ConnectPause) -> Ex
     let conditions = Conditions {
         may_send: &|is_sent| permit.check(is_sent),
         may_continue: allows.as_ref().map(|allows| allows as &dyn Fn() -> bool),
+        peers: permit.peers.clone(),
     };
     let answer = client.call(&conditions, unit_id, request, timeout, |_, pdu| pdu.to_vec());
     let answer = answer.map_err(Arc::new);
@@ -144,7 +145,7 @@ fn carried_out(client: &BlockingClient, call: &Call, pause: &ConnectPause) -> Ex
                 pause.failed(Arc::clone(error));
             }
             // It was not tried.
-            ClientError::Fenced | ClientError::Expired => {}
+            ClientError::Fenced | ClientError::Expired | ClientError::Elsewhere => {}
             _ => pause.connected(),
         },
         Ok(_) => pause.connected(),

@@ -4,6 +4,7 @@ use std::cell::{Cell, RefCell};
 use std::collections::BTreeMap;
 use std::future::poll_fn;
 use std::io::{self, ErrorKind};
+use std::net::IpAddr;
 use std::rc::Rc;
 use std::sync::Arc;
 use std::task::{Poll, ready};
@@ -74,6 +75,8 @@ type Waiting = BTreeMap<Ticket, oneshot::Sender<Outcome>>;
 
 /// An open connection.
 struct Open {
+    /// `None` if the system does not tell it.
+    peer: Option<IpAddr>,
     connection: Connection,
     epoch: Epoch,
     waiting: Waiting,
@@ -134,6 +137,11 @@ impl TcpLink {
         loop {
             if self.open.borrow().is_none() {
                 self.connect(deadline, timeout, eager, permit).await?;
+            }
+            if let Some(open) = self.open.borrow().as_ref()
+                && !permit.peers.hold(open.peer)
+            {
+                return Err(Arc::new(ClientError::Elsewhere));
             }
             if let (Some(open), Some(fence)) = (self.open.borrow_mut().as_mut(), &permit.fence) {
                 open.pass.get_or_insert_with(|| fence.pass());
@@ -206,7 +214,8 @@ impl TcpLink {
         permit.check(false)?;
         let found =
             match timeout_at(deadline, name_lookup::addresses_of(&self.host, self.port)).await {
-                Ok(found) => found,
+                Ok(Ok(found)) => Ok(permit.peers.among(found).ok_or(ClientError::Elsewhere)?),
+                Ok(Err(error)) => Err(error),
                 Err(_) => {
                     let error = ClientError::LookupTimeout { to: self.url.clone(), after: timeout };
                     return Err(self.pause.failed(error));
@@ -243,11 +252,13 @@ impl TcpLink {
 
     fn take(&self, stream: TcpStream, tls: Option<Channel>) {
         let _ = stream.set_nodelay(true);
+        let peer = stream.peer_addr().ok().map(|peer| peer.ip());
         let (reader, writer) = stream.into_split();
         let (transport, now) = (Transport::Tcp, self.epoch.elapsed());
         let mut connection = connection(transport, self.tolerance, now);
         connection.follow(self.past.take());
         let open = Open {
+            peer,
             connection,
             epoch: self.epoch,
             waiting: Waiting::default(),

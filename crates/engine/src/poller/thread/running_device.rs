@@ -123,7 +123,7 @@ impl RunningDevice {
     fn permit(&self, until: Option<Instant>) -> Permit {
         let device = self.writes.subscribe();
         let wanted: Wanted = Arc::new(move |_| device.has_changed().is_ok());
-        Permit { fence: self.fence.clone(), until, wanted: Some(wanted) }
+        Permit { fence: self.fence.clone(), until, wanted: Some(wanted), ..Permit::default() }
     }
 
     /// Sends a write between two reads, as soon as possible, unless its receiver withdraws it before. One that
