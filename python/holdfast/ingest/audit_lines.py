@@ -58,11 +58,11 @@ class Recording:
     def done(self, sequence: int | None = None) -> None:
         """The commands were carried out, in the step of a log with this number."""
         if self._group is None:
-            self._audit.write_all(self._lines("done", sequence), done=True)
+            self._audit.write_all(self._lines("done", sequence))
 
     def not_confirmed(self) -> None:
         """Nobody knows whether the commands will be carried out."""
-        self._audit.write_all(self._lines("not_confirmed"), done=True)
+        self._audit.write_all(self._lines("not_confirmed"))
 
     def answered(self, device: str, code: int | None) -> None:
         """A device was sent the commands in place of memory, and answered with this exception, if
@@ -72,7 +72,7 @@ class Recording:
         if code is not None:
             outcome = EXCEPTIONS.get(code, f"exception {code:02x}").lower().replace(" ", "_")
         route = b"," + encoded({"route": device})[1:-1]
-        self._audit.write_all(self._lines(outcome, route=route), done=True)
+        self._audit.write_all(self._lines(outcome, route=route))
 
     def _lines(
         self, outcome: str, sequence: int | None = None, *, route: bytes = b""

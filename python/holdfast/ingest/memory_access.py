@@ -313,7 +313,7 @@ class MemoryAccess:
                 "outcome": refused.reason,
             }
             if refused.reason == "internal_error":  # The write may have been carried out.
-                self._audit.write_all([line], done=True)
+                self._audit.write(**line)
             else:
                 self._audit.write_refused(**line)
 

@@ -153,7 +153,7 @@ class WriteRecorder:
             more = self._refusals.rest() if ended else self._refusals.take()
             while self._events:
                 more.append(self._events.popleft())
-            self._audit.write_all([*lines, *more], done=True)
+            self._audit.write_all([*lines, *more])
             self._log_lost()
             if ended and not writes:
                 return

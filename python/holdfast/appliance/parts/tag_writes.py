@@ -148,7 +148,7 @@ class TagWrites:
         try:
             if self._audit is not None:
                 # Whatever the outcome, the device may have carried out the write.
-                self._audit.write_all([{**write.record, "outcome": outcome}], done=True)
+                self._audit.write(**write.record, outcome=outcome)
             write.done(refused)
         except Exception:  # A fault in one outcome must not end all others.
             log_lines.problem("tag_write_failed")

@@ -84,19 +84,19 @@ class Audit:
         if self.refusals.has_line(fields):
             self.write(**fields)
 
-    def write_all(self, lines: Iterable[Line], *, done: bool = False) -> None:
+    def write_all(self, lines: Iterable[Line]) -> None:
         """Writes lines, all with the present time.
 
         After lines that could not be written, a line with their number comes first. But if the log
-        is `fail_closed` and the lines are `done`, writes that were carried out, they wait in
-        memory, and are written as soon as that is possible.
+        is `fail_closed`, they wait in memory, and are written as soon as that is possible: writes
+        that were carried out before it failed, then refusals and events, which are few.
         """
         records = self._records(lines)
         with self._lock:
             stored = self._store(records)
             if stored == len(records):
                 return
-            if self.fail_closed and done:
+            if self.fail_closed:
                 self._waiting += records[stored:]
             else:
                 self._lose(records[stored:])
