@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 READ = bytes.fromhex("0300050001")
 FIVE = bytes.fromhex("03020005")
+ZERO = bytes.fromhex("03020000")
 SIXTH = bytes.fromhex("0300060001")
 SIX = bytes.fromhex("03020006")
 WRITE = bytes.fromhex("0600051234")
@@ -601,6 +602,40 @@ def test_every_network_transport_leads_to_devices(run: Run, connect: Connect, ki
         assert front.ask(READ) == FIVE
         assert front.ask(WRITE) == WRITE
         assert front.ask(READ) == bytes.fromhex("03021234")
+
+
+def test_a_client_that_waits_for_a_device_gives_way_only_to_another_if_all_wait(
+    device: Stream, run: Run, connect: Connect
+) -> None:
+    first, second = Held(), Held()
+    device.script = [first, second]
+    limits = {"max_connections": 2, "when_full": "evict"}
+    text = configuration(device.url, units=BESIDE_MEMORY, memories=MEMORY, listener=limits)
+    appliance = run(text)
+
+    def idle() -> wire.Connection:
+        made = connect(scada(appliance))
+        assert made.ask(READ, unit=2) == ZERO
+        return made
+
+    waiting = connect(scada(appliance))
+    waiting.send(wire.frame(READ))
+    device.await_requests(1)
+    one, other = idle(), idle()
+    assert one.rest() == b""
+    first.release()
+    assert waiting.receive().pdu == FIVE
+    newest = idle()
+    assert other.rest() == b"", "its request is older than the reply"
+
+    waiting.send(wire.frame(READ))
+    device.await_requests(2)
+    newest.send(wire.frame(SIXTH))
+    await_count(appliance, "waiting", 2)
+    idle()
+    assert waiting.rest() == b""
+    second.release()
+    assert newest.receive().pdu == SIX
 
 
 class OnLine:

@@ -22,8 +22,8 @@ use crate::tls::server::PeerCertificate;
 pub enum WhenFull {
     /// The new connection is closed.
     Refuse,
-    /// The connection that has been idle longest is closed. A connection in the middle of a Raw
-    /// Ingest packet is closed only if all are.
+    /// The connection that has been idle longest is closed. One that waits for a reply of Modbus, or is in the
+    /// middle of a Raw Ingest packet, is closed only if all are like it.
     Evict,
 }
 
@@ -97,7 +97,7 @@ pub struct OpenConnection {
     pub id: u64,
     pub peer: Peer,
     pub opened: SystemTime,
-    /// The time since the last request, or since it was opened.
+    /// The time since the last request or late reply, or since it was opened.
     pub idle: Duration,
 }
 
@@ -366,6 +366,13 @@ impl Ticket {
     #[inline]
     pub(crate) fn touch(&self, now: Instant) {
         self.activity.last_request.store(self.admission.since(now), Ordering::Relaxed);
+    }
+
+    /// Records the time of a request of Modbus, or of a reply that came later, and whether more are to come.
+    #[inline]
+    pub(crate) fn touch_modbus(&self, now: Instant, awaits_reply: bool) {
+        self.touch(now);
+        self.activity.awaits_reply.store(awaits_reply, Ordering::Relaxed);
     }
 
     /// Records the certificate that the peer has proved to own.

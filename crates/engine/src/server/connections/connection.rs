@@ -303,7 +303,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
                 len += written;
                 self.share.charge(taken);
             }
-            self.deadlines.note_request(Instant::now());
+            self.note_exchange(Instant::now());
             if len > 0 {
                 self.stream.send(&output[..len], &mut self.unsent)?;
             }
@@ -328,8 +328,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
     fn note_answered(&mut self, answered: &Answered, work_before: u32) {
         let now = Instant::now();
         if answered.requests > 0 {
-            self.deadlines.note_request(now);
-            self.ticket.touch(now.into_std());
+            self.note_exchange(now);
         }
         self.share.charge(work_before + (answered.requests + answered.discarded) as u32);
         let is_at_start = F::is_at_start(&self.answering.before);
@@ -339,6 +338,13 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
         // Bytes that are discarded until a silence do not put off the end of the connection.
         let is_new = answered.requests > 0 || answered.consumed > 0 && is_at_start;
         self.deadlines.note_partial(now, is_new);
+    }
+
+    /// Notes a request that was complete, or a reply that has come.
+    #[inline]
+    fn note_exchange(&mut self, now: Instant) {
+        self.deadlines.note_request(now);
+        self.ticket.touch_modbus(now.into_std(), self.answering.is_waiting());
     }
 
     /// Waits for the peer to read its replies.

@@ -74,6 +74,7 @@ impl Crowd {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Standing {
     Idle,
+    AwaitsReply,
     AmidPacket,
     /// It has just had its response.
     JustServed,
@@ -93,10 +94,13 @@ pub(super) struct Held {
 /// What a connection and the table of connections tell each other without waiting.
 #[derive(Debug, Default)]
 pub(super) struct Activity {
-    /// In microseconds since the epoch of the admission. Before any request, when it was admitted.
+    /// In microseconds since the epoch of the admission. A reply that comes later counts as a request. Before any,
+    /// when it was admitted.
     pub(super) last_request: AtomicU64,
     pub(super) is_amid_packet: AtomicBool,
-    /// Whether the peer waits for a response that takes its time.
+    /// Whether the peer waits for a reply of Modbus that comes later.
+    pub(super) awaits_reply: AtomicBool,
+    /// Whether the peer waits for a response of HTTP that takes its time.
     pub(super) is_busy: AtomicBool,
     /// Whether `last_request` is the time of the last response.
     pub(super) is_served: AtomicBool,
@@ -115,6 +119,8 @@ impl Held {
         let longer = if has_no_request { LONGER_WITHOUT_REQUEST.as_micros() as i128 } else { 0 };
         let standing = if self.activity.is_amid_packet.load(Ordering::Relaxed) {
             Standing::AmidPacket
+        } else if self.activity.awaits_reply.load(Ordering::Relaxed) {
+            Standing::AwaitsReply
         } else if self.waited(now) < grace {
             Standing::JustServed
         } else {
