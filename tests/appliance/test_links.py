@@ -12,7 +12,8 @@ from holdfast.adapters.rest.operations import document
 from holdfast.config import load
 from holdfast.events import log_lines
 from support import web, wire
-from support.fake_device import Stream, exception, silent
+from support.fake_device import Serial, Stream, exception, silent
+from support.lines import RTU
 from support.routed import Held, await_count, configuration, counters
 from support.running import endpoint
 
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 READ = bytes.fromhex("0300050001")
 FIVE = bytes.fromhex("03020005")
+WRITE = bytes.fromhex("0600051234")
 NONE = dict.fromkeys(
     (
         "requests",
@@ -229,6 +231,42 @@ def test_the_log_has_that_a_device_does_not_answer(run: Run, records: web.Record
             assert ask(appliance, READ, unit=number) == exception(READ, 0x0B)
             appliance.log_events(timeout=0)
             assert len(records.of("link_down")) == number // 2
+
+
+def broadcast(appliance: Appliance) -> None:
+    """Sends a write to all units of a line, and waits until it is sent."""
+    sent = counters(appliance)["replies"] + 1
+    with wire.Connection(endpoint(appliance, "scada")) as client:
+        client.send(wire.frame(WRITE, unit=0))
+        await_count(appliance, "replies", sent)
+
+
+def test_a_broadcast_is_no_answer_of_a_line(run: Run, tmp_path: Path) -> None:
+    with Serial(RTU, tmp_path / "line", then=silent) as device:
+        appliance = run(configuration(device.url, link={"timeout": 0.1}))
+        for unit in (1, 2, 3):
+            assert counters(appliance)["error"] is None
+            broadcast(appliance)
+            assert ask(appliance, READ, unit) == exception(READ, 0x0B)
+        broadcast(appliance)
+        assert counters(appliance)["error"] == "no reply within 0.1 s"
+
+
+def test_a_broadcast_shows_that_a_line_can_be_opened_again(run: Run, tmp_path: Path) -> None:
+    with Serial(RTU, tmp_path / "line", then=silent) as device:
+        name = tmp_path / "name"
+        url = device.url.replace(str(device.terminal.device), str(name))
+        appliance = run(configuration(url))
+        assert ask(appliance, READ) == exception(READ, 0x0A)
+        assert str(name) in counters(appliance)["error"]
+        name.symlink_to(device.terminal.device)
+        with wire.Connection(endpoint(appliance, "scada")) as client:
+
+            def is_mended() -> bool:
+                client.send(wire.frame(WRITE, unit=0))
+                return counters(appliance)["error"] is None
+
+            wire.until(is_mended, "the line is opened")
 
 
 def test_the_log_has_that_a_queue_was_full(

@@ -65,9 +65,9 @@ def serial_configuration(url: str, kind: str, device: Path, **more: Any) -> str:
     )
 
 
-def counters(appliance: Appliance, link: str = "bus") -> dict[str, int]:
-    """Returns the counters of a link."""
-    counted: dict[str, int] = appliance.diagnostics.stats()["links"][link]
+def counters(appliance: Appliance, link: str = "bus") -> dict[str, Any]:
+    """Returns the counters of a link, and its `error`."""
+    counted: dict[str, Any] = appliance.diagnostics.stats()["links"][link]
     return counted
 
 

@@ -199,6 +199,16 @@ impl Serving {
                     shared.set_error(Some(error));
                 }
             }
+            // Nobody replies to a broadcast: it shows that the line can be used, not that a unit answers.
+            Ok(pdu) if pdu.is_empty() => {
+                let has_no_reply = |error: Arc<ClientError>| {
+                    use ClientError::{Incomplete, Invalid, Timeout};
+                    matches!(*error, Timeout(_) | Incomplete(_) | Invalid(_))
+                };
+                if !shared.error().is_some_and(has_no_reply) {
+                    shared.set_error(None);
+                }
+            }
             _ => {
                 self.failures.set(0);
                 self.answered.set(Some(Instant::now()));
