@@ -625,17 +625,19 @@ def test_a_client_that_waits_for_a_device_gives_way_only_to_another_if_all_wait(
     assert one.rest() == b""
     first.release()
     assert waiting.receive().pdu == FIVE
-    newest = idle()
+    third = idle()
     assert other.rest() == b"", "its request is older than the reply"
+    fourth = idle()
+    assert waiting.rest() == b"", "it waits no longer"
 
-    waiting.send(wire.frame(READ))
+    third.send(wire.frame(READ))
     device.await_requests(2)
-    newest.send(wire.frame(SIXTH))
+    fourth.send(wire.frame(SIXTH))
     await_count(appliance, "waiting", 2)
     idle()
-    assert waiting.rest() == b""
+    assert third.rest() == b"", "all wait"
     second.release()
-    assert newest.receive().pdu == SIX
+    assert fourth.receive().pdu == SIX
 
 
 class OnLine:
