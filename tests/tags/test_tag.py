@@ -96,6 +96,9 @@ def test_what_is_read_can_be_written_and_gives_the_same_registers(
         (Decimal("-1e999999999"), {}, "a Fraction is too large"),
         (Decimal("1e-999999999"), {}, "is between two values of the registers"),
         (Fraction(10**400), {}, "a Fraction is too large"),
+        (Decimal("6." + "1" * 5000), {"max": 5}, "^a Decimal is outside the limits, allowed: up"),
+        (Fraction(10**5000 + 1, 10**5000), {}, "^a Fraction is between two values"),
+        (Decimal("5." + "0" * 5000 + "1"), {"max": 5}, "^a Decimal is outside the limits"),
         (10**400, {}, "an integer of 1329 bits is too large"),
         (-(10**400), {"type": "float64"}, "an integer of 1329 bits is too large"),
         (1e308, {"type": "float32", "scale": 0.001}, r"1e\+308 does not fit float32$"),
@@ -125,13 +128,17 @@ def test_a_value_that_does_not_fit_is_refused(
         (Fraction(43, 2), {"scale": 0.1}, 215),
         ([Decimal(1), 2], {"type": "uint16[2]"}, [1, 2]),
         (Decimal("0.1"), {"type": "float32"}, 0.1),
+        (Decimal("0." + "3" * 5000), {"type": "float64"}, 1 / 3),
+        (Fraction(10**5000 + 1, 3 * 10**5000), {"type": "float64"}, 1 / 3),
         (Decimal(2**64 + 1) / 2**12, {"type": "float64", "scale": 0.5}, 2.0**53),
     ],
 )
 def test_decimals_and_fractions_are_numbers(
     value: Any, settings: dict[str, Any], number: Any
 ) -> None:
-    assert tag(**settings).raw(value) == number
+    raw = tag(**settings).raw(value)
+    assert raw == number
+    assert type(raw) is type(number)
 
 
 @pytest.mark.parametrize(

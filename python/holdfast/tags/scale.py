@@ -140,7 +140,7 @@ class Linear:
         except OverflowError:
             return math.copysign(math.inf, number) * float(self._scale)
 
-    def number(self, value: float) -> Fraction:
+    def number(self, value: float | Fraction) -> Fraction:
         """The number in the registers for a finite value."""
         return (_exact(value) - self._offset) / self._scale
 
@@ -166,6 +166,6 @@ def is_finite(number: float | Fraction) -> bool:
         return False
 
 
-def _exact(number: float) -> Fraction:
+def _exact(number: float | Fraction) -> Fraction:
     """The number as it is written."""
     return Fraction(repr(number)) if isinstance(number, float) else Fraction(number)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from holdfast.protocol import WRITE_LIMITS
 from holdfast.tags.rounding import ROUNDING_OF_WRITES, nearest_step
@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from holdfast.tags.scale import Linear
     from holdfast.types import Area
     from holdfast.values.types import Type
+
+_MAX_SHOWN: Final = 100
+"""Maximum number of characters of a number in a message."""
 
 
 class WritableTag(ScaledTag):
@@ -77,22 +80,27 @@ class WritableTag(ScaledTag):
             raise DoesNotFit(f"{shown(real)} is {flaw}")
         # A float means what is written: as such, 0.1 is equal to a `min` of 0.1.
         is_float = isinstance(real, Fraction) and Fraction(repr(float(real))) == real
-        value = float(real) if is_float else real
+        number = float(real) if is_float else real
         if isinstance(self.scale, RegisterScale):
             raise DoesNotFit(self.unscaled)
-        number = self._number(value, abs(self.scale), default_round)
-        if self.null and self.is_null(self._held(number)):
-            raise DoesNotFit(f"{value} stands for no value (`null` in the tag)")
-        return number
+        found = self._number(number, value, abs(self.scale), default_round)
+        if self.null and self.is_null(self._held(found)):
+            raise DoesNotFit(f"{_text(value)} stands for no value (`null` in the tag)")
+        return found
 
-    def _number(self, value: float, step: float, default_round: Rounding) -> float:
-        self._check_limits(value, f"{value} is")
+    def _number(
+        self, value: float | Fraction, given: Any, step: float, default_round: Rounding
+    ) -> float:
+        if flaw := self._beyond(value):
+            raise DoesNotFit(f"{_text(given)} is {flaw}")
         if self.is_float:
-            number = self._float(value)
+            number = self._float(value, given)
             held = self._held(number)
             if self.of_type.base == "float16":
                 rounded = self._linear.value(held)
-                self._check_limits(rounded, f"{value} is {rounded} in {self.of_type.element},")
+                if flaw := self._beyond(rounded):
+                    found = f"{_text(given)} is {rounded} in {self.of_type.element}"
+                    raise DoesNotFit(f"{found}, {flaw}")
             if held and default_round == "exact":
                 return number
             # With an offset, the digits that a float has too much are no reason to refuse 0.
@@ -100,7 +108,7 @@ class WritableTag(ScaledTag):
                 self._linear.value(0), value, rel_tol=1e-15
             ):
                 return held
-            raise DoesNotFit(f"{value} is too small for {self.type}, which would hold 0")
+            raise DoesNotFit(f"{_text(given)} is too small for {self.type}, which would hold 0")
         exact = self._linear.number(value)
         if exact.denominator == 1:
             return exact.numerator
@@ -111,18 +119,19 @@ class WritableTag(ScaledTag):
         steps = f"steps of {step}"
         if not self.is_stepped or (self.round or default_round) == "exact":
             other = ", or `round: nearest` in the tag" if self.is_stepped and not self.round else ""
-            found = f"{value} is between two values of the registers"
+            found = f"{_text(given)} is between two values of the registers"
             raise DoesNotFit(f"{found}, allowed: {steps}{other}")
-        self._check_limits(rounded, f"{value} is {rounded} in {steps},")
+        if flaw := self._beyond(rounded):
+            raise DoesNotFit(f"{_text(given)} is {rounded} in {steps}, {flaw}")
         return nearest
 
-    def _float(self, value: float) -> float:
-        if self._linear.is_identity:
+    def _float(self, value: float | Fraction, given: Any) -> float:
+        if self._linear.is_identity and not isinstance(value, Fraction):
             return value
         try:
             return nearest_float(self._linear.number(value), self.of_type.base)
         except OverflowError:
-            raise DoesNotFit(f"{value} does not fit {self.type}") from None
+            raise DoesNotFit(f"{_text(given)} does not fit {self.type}") from None
 
     def _held(self, number: float) -> float:
         """What the registers make of a number."""
@@ -133,19 +142,30 @@ class WritableTag(ScaledTag):
         except OverflowError:
             return number  # The codec refuses it, and says what the type allows.
 
-    def _check_limits(self, value: float, found: str) -> None:
+    def _beyond(self, value: float | Fraction) -> str | None:
+        """What is wrong with a value beyond the limits of the tag."""
         least, most = self.min, self.max
-        if (least is not None and value < least) or (most is not None and value > most):
-            if least is not None and most is not None:
-                raise DoesNotFit(f"{found} outside {least} to {most}")
-            allowed = f"up to {most}" if least is None else f"at least {least}"
-            raise DoesNotFit(f"{found} outside the limits, allowed: {allowed}")
+        if (least is None or value >= least) and (most is None or value <= most):
+            return None
+        if least is not None and most is not None:
+            return f"outside {least} to {most}"
+        allowed = f"up to {most}" if least is None else f"at least {least}"
+        return f"outside the limits, allowed: {allowed}"
 
     def _named(self, name: str) -> int:
         for value, known in self.states.items():
             if known == name:
                 return value
         raise DoesNotFit(f"{name!r} is no state, allowed: {', '.join(self.states.values())}")
+
+
+def _text(number: Any) -> str:
+    """A number for a message, as it was given unless it is long."""
+    try:
+        text = str(number)
+    except ValueError:  # An integer in it has more digits than Python converts.
+        return shown(number)
+    return text if len(text) <= _MAX_SHOWN else shown(number)
 
 
 def unwritable(area: Area, type: Type, named: str) -> str | None:

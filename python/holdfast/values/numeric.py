@@ -38,25 +38,35 @@ MAX_EXACT = 1 << 53
 MAX_EXPONENT = 400
 """Of a `Decimal` that becomes a fraction. No float has as large or as small a number."""
 
+MAX_DIGITS = 800
+"""Of a `Decimal` that becomes a fraction. Floats, and numbers halfway between two, have fewer."""
+
 
 def as_real(value: Any) -> Any:
-    """A number of any library, also a `Decimal`, exactly; `None` for anything else."""
+    """A number of any library, also a `Decimal`; `None` for anything else.
+
+    A `Decimal` of more than `MAX_DIGITS` digits is rounded so that it is still on the same side of
+    every number of a few digits less: rounding it again gives the same as the exact number.
+    """
     if isinstance(value, bool):
         return None
     if isinstance(value, Real):
         return value
-    from decimal import Decimal  # Who has none does not need it.
+    import decimal  # Who has none does not need it.
     from fractions import Fraction
 
-    if not isinstance(value, Decimal) or value.is_snan():
+    if not isinstance(value, decimal.Decimal) or value.is_snan():
         return None
     if not value or not value.is_finite():
         return float(value)
     exponent = value.adjusted()
     if abs(exponent) > MAX_EXPONENT:  # Its fraction would fill the memory.
         exponent = MAX_EXPONENT if exponent > 0 else -MAX_EXPONENT
-        value = Decimal((int(value.is_signed()), (1,), exponent))
-    return Fraction(value)
+        value = decimal.Decimal((int(value.is_signed()), (1,), exponent))
+    # `ROUND_05UP` is to decimal digits what rounding to odd is to binary ones.
+    least, most = decimal.MIN_EMIN, decimal.MAX_EMAX
+    context = decimal.Context(MAX_DIGITS, decimal.ROUND_05UP, least, most, traps=[])
+    return Fraction(context.plus(value))
 
 
 def limits(base: str) -> tuple[float, float]:
