@@ -96,6 +96,8 @@ def test_what_is_read_can_be_written_and_gives_the_same_registers(
         (Decimal("-1e999999999"), {}, "a Fraction is too large"),
         (Decimal("1e-999999999"), {}, "is between two values of the registers"),
         (Fraction(10**400), {}, "a Fraction is too large"),
+        (Decimal("1e-330"), {"type": "float32"}, "^1E-330 is too small for float32, which would"),
+        (Fraction(1, 10**330), {"type": "float64", "scale": 0.5}, "^a Fraction is too small for"),
         (Decimal("6." + "1" * 5000), {"max": 5}, "^a Decimal is outside the limits, allowed: up"),
         (Fraction(10**5000 + 1, 10**5000), {}, "^a Fraction is between two values"),
         (Decimal("5." + "0" * 5000 + "1"), {"max": 5}, "^a Decimal is outside the limits"),

@@ -104,9 +104,9 @@ class WritableTag(ScaledTag):
             if held and default_round == "exact":
                 return number
             # With an offset, the digits that a float has too much are no reason to refuse 0.
-            if default_round == "nearest" or math.isclose(
-                self._linear.value(0), value, rel_tol=1e-15
-            ):
+            zero = self._linear.value(0)
+            is_zero = zero == value or (float(value) and math.isclose(zero, value, rel_tol=1e-15))
+            if default_round == "nearest" or is_zero:
                 return held
             raise DoesNotFit(f"{_text(given)} is too small for {self.type}, which would hold 0")
         exact = self._linear.number(value)
