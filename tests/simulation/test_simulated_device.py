@@ -403,6 +403,7 @@ def test_a_state_is_played_back_by_its_name(tmp_path: Path) -> None:
         ("time,t\n1\n", ":2: found 1 cells, allowed: 2"),
         ('t\n"1,5"\n', ":2: t: '1,5' has a decimal comma"),
         ("time;t\n1;1,5\n", ":2: t: '1,5' has a decimal comma"),
+        ("t\n1\n\xb0\n", ":3: not UTF-8, allowed: CSV in UTF-8"),
         (codecs.BOM_UTF16_LE.decode("latin-1"), "a file in UTF-16, allowed: CSV in UTF-8"),
         ("t\n1e999\n", ":2: t: '1e999' is not a finite number"),
         ("t\ninf\n", ":2: t: 'inf' is not a number"),
@@ -416,6 +417,17 @@ def test_a_file_that_can_not_be_played_back_is_refused(
     file.write_text(text, encoding="latin-1")
     tags = TagList([Tag("t", "holding_registers", 0)])
     with pytest.raises(playback.Unplayable, match=message):
+        playback.load(file, tags)
+
+
+def test_a_file_is_not_read_beyond_its_maximum_number_of_rows(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(playback, "MAX_ROWS", 2)
+    file = tmp_path / "values.csv"
+    file.write_bytes(b"t\n1\n2\n3\n\xb0\n")
+    tags = TagList([Tag("t", "holding_registers", 0)])
+    with pytest.raises(playback.Unplayable, match=":4: more than 2 rows"):
         playback.load(file, tags)
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import csv
-import io
-from itertools import chain, repeat
+from itertools import chain, islice, repeat
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast.config.text import yaml_document
@@ -15,7 +14,7 @@ from holdfast.tags.text import csv_separator, value_from
 from holdfast.values import DoesNotFit
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
     from pathlib import Path
 
     from holdfast.tags import Tag, TagList
@@ -48,16 +47,29 @@ def load(path: Path, tags: TagList) -> Played:
     Raises `Unplayable`, which names file and line, and `OSError`.
     """
     try:
-        # A text that a device has, and its recording, may contain NUL.
-        text = yaml_document.decoded(path.read_bytes(), str(path), "CSV", may_have_nul=True)
-        lines = io.StringIO(text, newline="")
-        separator = csv_separator(lines.readline())
-        lines.seek(0)
-        return _columns(csv.reader(lines, delimiter=separator), str(path), tags)
+        with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
+            lines = _checked(file, str(path))
+            first = [*islice(lines, 1)]
+            separator = csv_separator("".join(first))
+            rows = csv.reader(chain(first, lines), delimiter=separator)
+            return _columns(rows, str(path), tags)
     except ConfigError as error:
         raise Unplayable(str(error)) from error
     except csv.Error as error:
         raise Unplayable(f"{path}: not CSV: {error}") from error
+
+
+def _checked(lines: Iterable[str], file: str) -> Iterator[str]:
+    """The lines of a file, one at a time. Raises `ConfigError` for one that is not UTF-8."""
+    for number, line in enumerate(lines, 1):
+        if not line.isascii():
+            try:
+                line.encode()
+            except UnicodeEncodeError:
+                data = line.encode(errors="surrogateescape")
+                # A text that a device has, and its recording, may contain NUL.
+                yaml_document.decoded(data, file, "CSV", may_have_nul=True, line=number)
+        yield line
 
 
 def _columns(rows: Any, file: str, tags: TagList) -> Played:

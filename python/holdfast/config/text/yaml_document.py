@@ -187,8 +187,13 @@ def _error(file: str, message: str, line: int | None = None) -> ConfigError:
     return ConfigError(file, [Problem(file, line, None, "", message)])
 
 
-def decoded(data: bytes, file: str, form: str = "YAML", *, may_have_nul: bool = False) -> str:
-    """Decodes the content of a file, which has to be of the `form`. Raises `ConfigError`."""
+def decoded(
+    data: bytes, file: str, form: str = "YAML", *, may_have_nul: bool = False, line: int = 1
+) -> str:
+    """Decodes the content of a file, which has to be of the `form`. Raises `ConfigError`.
+
+    `line` is the number of its first line.
+    """
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         raise _error(file, f"a file in UTF-16, allowed: {form} in UTF-8; save it as UTF-8")
     if b"\0" in data and not may_have_nul:
@@ -196,7 +201,7 @@ def decoded(data: bytes, file: str, form: str = "YAML", *, may_have_nul: bool = 
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
+        line += error.object[: error.start].count(b"\n")
         raise _error(file, f"not UTF-8, allowed: {form} in UTF-8", line) from None
 
 
