@@ -236,6 +236,9 @@ def test_readings_are_repeated_and_recorded(
             b"\xef\xbb\xbftime,hr:0\r\n",
             r"found '\ufefftime,hr:0\r' in the first line, as a spreadsheet has saved it, allowed",
         ),
+        (b"time;hr:0\r\n", r"found 'time;hr:0\r' in the first line, as a spreadsheet has saved it"),
+        (b"time\thr:0\r\n", "in the first line, as a spreadsheet has saved it, allowed"),
+        (b"time,hr:0 \n", "found 'time,hr:0 ' in the first line, allowed: 'time,hr:0'"),
     ],
 )
 def test_a_recording_with_other_columns_is_not_touched(

@@ -78,9 +78,10 @@ class Recording:
         if not head.startswith(found[: len(head)]):
             first, end, _ = found.partition(b"\n")
             more = "" if end or len(found) < most else "…"
-            allowed = head.strip()
-            is_resaved = end and first.removeprefix(codecs.BOM_UTF8).strip() == allowed
-            reason = ", as a spreadsheet has saved it" if is_resaved else ""
+            allowed = head.removesuffix(b"\n")
+            line = first.removeprefix(codecs.BOM_UTF8).rstrip(b"\r")
+            is_resaved = allowed in (line, line.replace(b";", b","), line.replace(b"\t", b","))
+            reason = ", as a spreadsheet has saved it" if end and is_resaved else ""
             raise NotARecording(
                 f"found {first.decode(errors='replace')!r}{more} in the first line{reason}, "
                 f"allowed: {allowed.decode()!r}, an empty file or a new one"
