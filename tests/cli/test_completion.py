@@ -64,4 +64,5 @@ def test_commands_areas_and_options_are_completed(monkeypatch: pytest.MonkeyPatc
     assert completed("holdfast", "describe", '""') == ["map", "guess", "identify", "status"]
     assert completed("holdfast", "check", "pl")[0] == "plan"
     for mistyped in ("reed", "import telegraff", "log statuss", "cert sho"):
-        completed("holdfast", *mistyped.split(), '""')
+        *group, word = mistyped.split()
+        assert completed("holdfast", *group, word, '""') == completed("holdfast", *group, '""')
