@@ -238,6 +238,8 @@ def test_every_field_has_a_value_and_every_value_a_field() -> None:
         layout.encode({"a": 1, "b": 1, "c": 1})
     with pytest.raises(TypeError, match=r"^values are a list, allowed: a mapping"):
         layout.encode([1, 2])  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"^values are None, allowed: a mapping"):
+        layout.encode(None)  # type: ignore[arg-type]
 
 
 def test_a_layout_can_be_copied() -> None:

@@ -110,7 +110,7 @@ class Layout:
 
     def _check_names(self, values: Mapping[str, Any]) -> None:
         if not isinstance(values, Mapping):
-            found = f"values are a {type(values).__name__}"
+            found = f"values are {shown(values)}"
             raise TypeError(f"{found}, allowed: a mapping with a value for each field")
         if values.keys() == set(self.names):
             return
