@@ -353,6 +353,15 @@ def test_a_wait_that_is_no_time_is_refused(gather: Any, error: type[Exception]) 
     Poller(gather=0).close()
 
 
+@pytest.mark.parametrize(("timeout", "error"), [(float("nan"), ValueError), ("x", TypeError)])
+def test_a_timeout_of_take_is_a_number(
+    poller: Poller, timeout: Any, error: type[Exception]
+) -> None:
+    with pytest.raises(error, match=rf"^timeout is {timeout!r}, allowed"):
+        poller.take(timeout)
+    assert poller.take(-1) is None
+
+
 @pytest.mark.parametrize("interval", ["1", None])
 def test_an_interval_is_a_number(poller: Poller, interval: Any) -> None:
     with pytest.raises(TypeError, match=f"interval is {interval!r}, allowed: 0.01 to"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import threading
 import time
@@ -250,8 +251,13 @@ class Poller:
         return self._results.dropped
 
     def take(self, timeout: float | None = None) -> Batch | None:
-        """The next batch; `None` if none comes within `timeout` seconds, or after `close`."""
+        """The next batch; `None` if none comes within `timeout` seconds, or after `close`.
+
+        Raises `ValueError` or `TypeError` for a `timeout` that is no time.
+        """
         self._check_process()
+        if timeout is not None:
+            timeout = checked_seconds("timeout", timeout, math.inf, -math.inf)
         began = time.monotonic()
         if self._given_up:
             asked = self._given_up.popleft()
