@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import _thread
 import asyncio
+import contextlib
 import itertools
 import sys
 import threading
@@ -469,6 +470,20 @@ def test_a_cancelled_wait_ends_neither_the_iteration_nor_loses_its_batch(
         batch = await asyncio.wait_for(following, wire.DEADLINE)
         assert batch is not None
         assert [reading.value for reading in batch] == [True]
+
+    asyncio.run(steps())
+
+
+def test_an_iteration_can_be_closed_and_another_goes_on(
+    device: holdfast.Server, poller: Poller
+) -> None:
+    poller.add(url(device), {"x": ("coils", 3)}, interval=0.01)
+
+    async def steps() -> None:
+        for _ in range(2):
+            batches: Any = aiter(poller)
+            async with contextlib.aclosing(batches):
+                await asyncio.wait_for(anext(batches), wire.DEADLINE)
 
     asyncio.run(steps())
 

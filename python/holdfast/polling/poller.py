@@ -372,6 +372,9 @@ class _Batches:
             raise StopAsyncIteration
         return batch
 
+    async def aclose(self) -> None:
+        """Does nothing: another iteration goes on. For `contextlib.aclosing`."""
+
 
 def _tags(tags: Mapping[str, Tag | tuple[Any, ...]]) -> Iterator[Tag]:
     if not isinstance(tags, Mapping):
