@@ -93,7 +93,9 @@ class Poller:
         self._connections: dict[tuple[str, str], tuple[dict[str, object], set[str]]] = {}
         """The options of each connection, and its devices."""
         self._changing = threading.RLock()
-        """Of all that `add` and `remove` change. A signal handler may call them too."""
+        """Of all that `add` and `remove` change. A signal handler that calls one of them does
+        not wait for the call that it interrupts, but may find it half done.
+        """
         self._names = itertools.count(1)
         self._generations = itertools.count(1)
         self._process = os.getpid()
