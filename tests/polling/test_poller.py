@@ -6,6 +6,7 @@ import _thread
 import asyncio
 import contextlib
 import itertools
+import signal
 import sys
 import threading
 import time
@@ -525,6 +526,15 @@ def test_a_write_that_a_close_has_interrupted_may_have_been_carried_out(poller: 
         poller.write("oven", "x", 1)
 
 
+@pytest.fixture
+def _ctrl_c() -> Iterator[None]:
+    """Ctrl-C is an exception, also in jobs of a shell that ignore it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("_ctrl_c")
 def test_a_write_that_a_signal_interrupts_is_not_sent_later(poller: Poller) -> None:
     interrupted, main = threading.Event(), threading.get_ident()
 
