@@ -27,6 +27,7 @@ from support.cases import examples
 from support.fake_device import FakeDevice, exception, registers
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from holdfast.discovery.described_tag import DescribedTag
@@ -321,18 +322,26 @@ def test_texts_and_arrays_are_what_the_device_takes_at_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("busy", "unread", "values"),
+    ("failure", "failing", "unread", "values"),
     [
-        ([0, 2, 4], [], (7, 7, 7)),
-        ([2, 3], [range(9)], (7, 7)),
-        ([1, 2], [range(9)], (7,)),
-        ([0, 1], [range(9)], None),
-    ],
+        (failure, *each)
+        for failure in (6, None)
+        for each in (
+            ([0, 2, 4], [], (7, 7, 7)),
+            ([2, 3], [range(9)], (7, 7)),
+            ([0, 1], [range(9)], (7, 7)),
+            (range(6), [range(9)], None),
+        )
+    ]
+    + [(4, [0], [range(9)], (7, 7)), (1, [0], [range(9)], None)],
 )
-def test_a_busy_device_is_asked_once_more_and_what_it_has_returned_is_kept(
-    busy: list[int], unread: list[range], values: tuple[int, ...] | None
+def test_what_fails_once_is_read_again_and_what_was_read_is_kept(
+    failure: int | None,
+    failing: Sequence[int],
+    unread: list[range],
+    values: tuple[int, ...] | None,
 ) -> None:
-    """A reading is one request, and one more if the device is busy."""
+    """A reading is one request, and one more if the device is busy or the reply is invalid."""
     again = itertools.count()
     is_searched = False
 
@@ -340,7 +349,9 @@ def test_a_busy_device_is_asked_once_more_and_what_it_has_returned_is_kept(
         first, count = int.from_bytes(pdu[1:3]), int.from_bytes(pdu[3:5])
         if pdu[0] != 3 or first + count > 9:
             return exception(pdu, 2)
-        return exception(pdu, 6) if is_searched and next(again) in busy else registers(pdu, 7)
+        if not is_searched or next(again) not in failing:
+            return registers(pdu, 7)
+        return bytes([3, 0]) if failure is None else exception(pdu, failure)
 
     def note(survey: Survey) -> None:
         nonlocal is_searched

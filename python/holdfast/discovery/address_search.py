@@ -280,8 +280,6 @@ class Survey:
         """The addresses that are read first in each area."""
         self._answered: Probe | None = None
         self._unanswered = 0
-        self._others = 0
-        """Requests that were counted by `count_request`."""
 
     @property
     def at(self) -> int:
@@ -296,7 +294,7 @@ class Survey:
     @property
     def requests(self) -> int:
         """How many requests were sent."""
-        return self._others + sum(found.requests for found in self.areas)
+        return sum(found.requests for found in self.areas)
 
     @property
     def is_done(self) -> bool:
@@ -394,21 +392,13 @@ class Survey:
 
     def ask(self, found: AreaMap, probe: Probe) -> Steps[Outcome]:
         """Sends a request, if that is allowed."""
-        self._check_limit()
+        if self.requests == self.max_requests:
+            raise LimitReached(f"stopped after {self.requests} requests")
         outcome = yield probe
         found.requests += 1
         if not isinstance(outcome, str):
             self._answered, self._unanswered = probe, 0
         return outcome
-
-    def count_request(self) -> None:
-        """Counts a request of the caller. Raises `LimitReached` if it must not be sent."""
-        self._check_limit()
-        self._others += 1
-
-    def _check_limit(self) -> None:
-        if self.requests == self.max_requests:
-            raise LimitReached(f"stopped after {self.requests} requests")
 
     def _look_whether_it_is_there(self, found: AreaMap) -> Steps[None]:
         assert self._answered is not None
@@ -699,35 +689,41 @@ async def run(survey: Survey, read: Callable[[Area, int, str], Awaitable[object]
 
 
 def read_in_parts(
-    read: Callable[[Area, int, str], list[int]], block: Probe, width: int
-) -> Iterator[tuple[Probe, list[int] | ModbusException]]:
-    """Reads a block that exists; halves what the device refuses, because it may take less at once.
-    Repeats a read once if the device was busy.
+    survey: Survey, read: Callable[[Area, int, str], list[int]], block: Probe, width: int
+) -> Iterator[tuple[Probe, list[int] | ModbusError]]:
+    """Reads a block that exists by the rules of a survey, which counts the requests; halves what
+    the device refuses, because it may take less at once.
 
-    Yields each part with its content, or with the exception of what can't be halved: an exception
-    other than 02 and 03, or `width` addresses.
+    Yields each part with its content, or with the error of what can't be halved: another one than
+    the exceptions 02 and 03, or `width` addresses. Raises `Unfinished`.
     """
-    try:
-        content = _read_or_repeat(read, block)
-    except ModbusException as error:
-        half = block.count // 2 // width * width
-        if error.code not in REFUSALS or not half:
-            yield block, error
-            return
+    content = _read_by_rules(survey, read, block)
+    half = block.count // 2 // width * width
+    if half and isinstance(content, ModbusException) and content.code in REFUSALS:
         area, middle = block.area, block.address + half
-        yield from read_in_parts(read, Probe(area, block.address, half), width)
-        yield from read_in_parts(read, Probe(area, middle, block.count - half), width)
+        yield from read_in_parts(survey, read, Probe(area, block.address, half), width)
+        yield from read_in_parts(survey, read, Probe(area, middle, block.count - half), width)
     else:
         yield block, content
 
 
-def _read_or_repeat(read: Callable[[Area, int, str], list[int]], block: Probe) -> list[int]:
-    try:
-        return read(block.area, block.address, _kind(block))
-    except ModbusException as error:
-        if error.code != BUSY:
-            raise
-    return read(block.area, block.address, _kind(block))
+def _read_by_rules(
+    survey: Survey, read: Callable[[Area, int, str], list[int]], block: Probe
+) -> list[int] | ModbusError:
+    results: list[list[int] | ModbusError] = []
+
+    def answer(probe: Probe) -> Outcome:
+        try:
+            results.append(read(probe.area, probe.address, _kind(probe)))
+        except ModbusError as error:
+            results.append(error)
+            return _failure(error, survey)
+        return None
+
+    found = next(each for each in survey.areas if each.area == block.area)
+    carry_out(survey.read(found, block), answer)
+    # A third read and those after it are of another block, to check the device.
+    return results[:2][-1]
 
 
 def _kind(probe: Probe) -> str:

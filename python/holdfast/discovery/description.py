@@ -13,6 +13,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from holdfast import values
+from holdfast.client.requests import REFUSALS
 from holdfast.discovery import (
     address_search,
     byte_order_habits,
@@ -23,8 +24,8 @@ from holdfast.discovery import (
 from holdfast.discovery.described_tag import DescribedTag
 from holdfast.discovery.device_search import Identity
 from holdfast.discovery.type_rarity import SIZES
-from holdfast.errors import ModbusException
-from holdfast.protocol import READ_LIMITS
+from holdfast.errors import ModbusError, ModbusException
+from holdfast.protocol import ILLEGAL_FUNCTION, READ_LIMITS
 from holdfast.tags import Tag
 from holdfast.types import BIT_AREAS, SHORT_OF
 
@@ -62,6 +63,9 @@ MAX_REGISTERS_IN_A_HURRY = 100
 MAX_ORDER_REGISTERS = 400
 """Registers from which the order of a device is inferred; more would cost time only."""
 
+REFUSED = (ILLEGAL_FUNCTION, *REFUSALS)
+"""Exceptions of what a device does not have; after others, the next read may succeed."""
+
 
 @dataclass
 class Description:
@@ -75,7 +79,7 @@ class Description:
     reads: dict[tuple[Area, range], list[list[int]]] = field(default_factory=dict)
     """The contents of what one request has read, of every time."""
     unread: dict[tuple[Area, str], list[range]] = field(default_factory=dict)
-    """Ranges that exist but could not be read again, by the reason."""
+    """Ranges that exist but that a later reading could not read, by the reason."""
     seen: dict[Area, dict[int, int]] = field(default_factory=dict)
     """The contents that the survey read."""
     orders: Mapping[str, float] = field(default_factory=dict)
@@ -107,10 +111,6 @@ def describe(
         content: list[int] = client.read(area, address, kind, unit=found.unit)
         return content
 
-    def read_more(area: Area, address: int, kind: str) -> list[int]:
-        survey.count_request()
-        return read(area, address, kind)
-
     def read_sunspec(address: int, count: int) -> list[int]:
         most = survey.max_quantity or READ_LIMITS["holding_registers"]
         stop = address + count
@@ -118,8 +118,10 @@ def describe(
         # No device takes less than a header, which is not there if it is refused.
         for first in range(address, stop, most):
             block = address_search.Probe("holding_registers", first, min(most, stop - first))
-            for _, content in address_search.read_in_parts(read_more, block, len(sunspec.HEADER)):
-                if isinstance(content, ModbusException):
+            for _, content in address_search.read_in_parts(
+                survey, read, block, len(sunspec.HEADER)
+            ):
+                if isinstance(content, ModbusError):
                     raise content
                 registers += content
         return registers
@@ -137,32 +139,32 @@ def describe(
     for turn in range(reads):
         if turn and blocks:
             time.sleep(every)
-        # What the device has refused is not asked again.
         blocks = [
-            (each, part)
-            for each, block in blocks
-            for part in _read_again(found, read_more, each, block)
+            (each, part) for each, block in blocks for part in _read_again(found, read, each, block)
         ]
 
 
 def _read_again(
     found: Description, read: Callable[[Area, int, str], list[int]], each: AreaMap, block: range
 ) -> list[range]:
-    """Reads a block, and keeps the contents. Returns the parts in which it could be read."""
+    """Reads a block, and keeps the contents. Returns the parts to read the next time: all but what
+    the device has refused.
+    """
     area = each.area
     probe = address_search.Probe(area, block.start, len(block))
-    answers = list(address_search.read_in_parts(read, probe, each.width))
+    answers = list(address_search.read_in_parts(found.survey, read, probe, each.width))
     before = found.reads.pop((area, block), [])
     parts = []
     for probe, content in answers:
         part = range(probe.address, probe.address + probe.count)
         known = slice(part.start - block.start, part.stop - block.start)
         contents = [old[known] for old in before]
-        if isinstance(content, ModbusException):
+        if isinstance(content, ModbusError):
             ranges = found.unread.setdefault((area, str(content)), [])
             address_search.add_addresses(ranges, part.start, len(part))
         else:
             contents.append(content)
+        if not (isinstance(content, ModbusException) and content.code in REFUSED):
             parts.append(part)
         if contents:
             found.reads[area, part] = contents

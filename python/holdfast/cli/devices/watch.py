@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from holdfast.cli.options.plc_addresses import Place
     from holdfast.cli.tags.options import Selection, TagFiles
     from holdfast.client import SyncClient
-    from holdfast.discovery.address_search import AreaMap
+    from holdfast.discovery.address_search import AreaMap, Survey
 
 TOKEN = "HOLDFAST_TOKEN"
 
@@ -156,7 +156,7 @@ def _device(url: str, chosen: tuple[Place, int] | None, unit: int, timeout: floa
             blocks += [
                 WatchedRange(None, unit, found.area, part.address, part.count)
                 for extent in found.ranges
-                for part in _parts(client, found, extent)
+                for part in _parts(client, survey, found, extent)
             ]
     except ModbusError as error:
         client.close()
@@ -167,7 +167,7 @@ def _device(url: str, chosen: tuple[Place, int] | None, unit: int, timeout: floa
     return sources.DeviceSource(where, url, client, blocks)
 
 
-def _parts(client: SyncClient, found: AreaMap, extent: range) -> list[Probe]:
+def _parts(client: SyncClient, survey: Survey, found: AreaMap, extent: range) -> list[Probe]:
     """A range, in parts that the device returns, if it takes less at once than the standard.
 
     What it refuses meanwhile is left out, and named. Other errors may pass: the first reading
@@ -179,7 +179,7 @@ def _parts(client: SyncClient, found: AreaMap, extent: range) -> list[Probe]:
     ]
     parts = []
     for block in blocks:
-        for part, content in address_search.read_in_parts(client.read, block, found.width):
+        for part, content in address_search.read_in_parts(survey, client.read, block, found.width):
             if isinstance(content, ModbusException) and content.code in REFUSALS:
                 at = coverage.shown([range(part.address, part.address + part.count)])
                 click.echo(f"{part.area} {at} is not watched: {content}", err=True)
