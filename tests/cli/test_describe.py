@@ -168,8 +168,33 @@ def test_a_device_that_ignores_unit_ids_is_described_once() -> None:
 
     with FakeDevice(answers) as device:
         found = answer("describe", device.url, "--units", "1-3", *QUICK)
-    assert (found["ignores_unit"], found["answering"]) == (True, [1, 2, 3])
+    assert (found["ignores_unit"], found["alike"]) == (True, [1, 2, 3])
     assert [each["unit"] for each in found["units"]] == [1]
+
+
+@pytest.mark.parametrize(
+    ("others", "alike", "described"), [("refused", [2, 4], [1, 3]), ("same", [2, 3, 4], [1, 2])]
+)
+def test_unit_ids_that_answer_otherwise_than_a_rare_one_are_devices(
+    others: str, alike: list[int], described: list[int]
+) -> None:
+    """Behind a gateway that refuses other unit ids with an exception, or answers them itself."""
+
+    def behave(asked: Asked) -> None:
+        if asked.pdu[0] == 17 and asked.unit == 1:
+            asked.answer(bytes([17, 5]) + b"METER")
+        elif asked.pdu[0] != 3 or (others == "refused" and asked.unit not in (1, 3)):
+            asked.answer(exception(asked.pdu, 4))
+        else:
+            asked.answer(registers(asked.pdu))
+
+    options = ("--areas", "hr", "--range", "0-8", "--times", "1")
+    with Stream("tcp", then=behave) as gateway:
+        found = answer("describe", gateway.url, "--units", "1-4", *options)
+        told = done("find", gateway.url, "--units", "1-4")[-1]
+    assert (found["ignores_unit"], found["alike"]) == (False, alike)
+    assert [each["unit"] for each in found["units"]] == described
+    assert told.endswith("answer as 231 does: probably no devices of their own.")
 
 
 def sunspec_from_0(pdu: bytes) -> bytes:

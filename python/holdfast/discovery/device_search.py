@@ -35,7 +35,10 @@ if TYPE_CHECKING:
     from holdfast.net.addresses import Address, Network
 
 UNUSUAL_UNIT = 231
-"""A unit id that is rare: a device that answers it too probably ignores unit ids."""
+"""A unit id that is rare: what answers as it does is probably no device of its own."""
+
+ANSWERS = "answers"
+"""The detail of a unit id that returns values."""
 
 HOST_UNITS = (1, 255, 0)
 """Unit ids to try at a host. Devices without a serial line often use 255 or 0."""
@@ -175,7 +178,7 @@ async def _ask(host: Host, client: Client, units: Sequence[int]) -> None:
     for unit in units:
         try:
             await client.read("holding_registers", 0, "uint16", unit=unit)
-            host.detail = "answers"
+            host.detail = ANSWERS
         except ModbusException as error:
             host.detail = str(error)
             if error.code in GATEWAY_FAILURES:
@@ -217,7 +220,7 @@ def probe(client: SyncClient, unit: int, *, delay: float = 0.0) -> Unit:
     """Asks one unit id. Raises `ConnectFailed`."""
     try:
         client.read("holding_registers", 0, "uint16", unit=unit)
-        detail = "answers"
+        detail = ANSWERS
     except ModbusException as error:
         if error.code in GATEWAY_FAILURES:
             return Unit(unit, answers=False, detail=str(error))
@@ -257,19 +260,31 @@ def server_identity(answer: ServerId) -> Identity:
     return Identity((("server_id", text),)) if len(text) >= 3 else Identity()
 
 
-def ignores_unit(
+def like_unusual(
     client: SyncClient, asked: Sequence[Unit], *, is_line: bool, delay: float = 0.0
-) -> bool:
-    """Whether a device probably ignores the unit id: it answers all, also a rare one.
+) -> list[Unit]:
+    """The unit ids that answer as a rare one does, which are probably no devices of their own: with
+    values or the same exception, and the same identification. All of them, if a device ignores unit
+    ids.
 
-    On a line, each unit id is a device of its own.
+    None if a unit id does not answer, or on a line, where each unit id is a device of its own.
     """
     if is_line or len(asked) < 2 or not all(unit.answers for unit in asked):
-        return False
-    # With all unit ids of the standard asked, there is no rare one left to ask.
-    if len(asked) >= MAX_SERIAL_UNIT:
-        return True
-    if any(unit.unit == UNUSUAL_UNIT for unit in asked):
-        return False
-    pause(delay)
-    return probe(client, UNUSUAL_UNIT, delay=delay).answers
+        return []
+    rare = next((unit for unit in asked if unit.unit == UNUSUAL_UNIT), None)
+    if rare is None:
+        pause(delay)
+        rare = probe(client, UNUSUAL_UNIT, delay=delay)
+    elif len(asked) < MAX_SERIAL_UNIT:
+        return []  # A device is expected there.
+    answer = (rare.answers, rare.detail, rare.identity)
+    return [unit for unit in asked if (unit.answers, unit.detail, unit.identity) == answer]
+
+
+def devices(asked: Sequence[Unit], alike: Sequence[Unit]) -> list[Unit]:
+    """The unit ids that are devices of their own, and one of those that answer `alike`, as
+    `like_unusual` returned them; not if others have values, and those have only an exception.
+    """
+    own = [unit for unit in asked if unit.answers and unit not in alike]
+    is_device = not own or any(unit.detail == ANSWERS or unit.identity.objects for unit in alike)
+    return [unit for unit in asked if unit in own or (is_device and unit in alike[:1])]

@@ -177,7 +177,7 @@ class _Run:
 
     def __post_init__(self) -> None:
         self._seen: list[Unit] = []
-        self._ignores = False
+        self._alike: list[Unit] = []
         self._found: list[Description] = []
         self._files: list[str] = []
         self._unwritten: Ended | None = None
@@ -189,7 +189,7 @@ class _Run:
 
     @property
     def _to_describe(self) -> list[Unit]:
-        return self._answering[:1] if self._ignores else self._answering
+        return device_search.devices(self._seen, self._alike)
 
     @property
     def _unread(self) -> Ended | None:
@@ -202,7 +202,7 @@ class _Run:
     def carry_out(self, client: SyncClient, *, is_line: bool) -> Ended | None:
         """Asks unit ids, and describes those that answer. Returns why it ended early, or `None`."""
         why = self._attempt(lambda: self._ask(client, is_line=is_line))
-        self.report.text(*units_lines(self.url, self.asked, self._seen, self._ignores))
+        self.report.text(*units_lines(self.url, self.asked, self._seen, self._alike))
         if why is not None:
             return why
         for each in self._to_describe:
@@ -228,7 +228,7 @@ class _Run:
         self.report.end(
             {
                 **ended_to_json(why),
-                **units_to_json(self.asked, self._seen, self._ignores),
+                **units_to_json(self.asked, self._seen, self._alike),
                 "not_described": left,
                 "files": self._files,
                 "units": [unit_to_json(each) for each in self._found],
@@ -250,7 +250,7 @@ class _Run:
                         about = dict(unit.identity.objects)
                         self.report.entry({"unit": unit.unit, "identification": about})
         if len(asked) == len(self._seen):
-            self._ignores = device_search.ignores_unit(
+            self._alike = device_search.like_unusual(
                 client, self._seen, is_line=is_line, delay=delay
             )
 

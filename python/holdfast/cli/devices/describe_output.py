@@ -10,6 +10,7 @@ from holdfast.cli.devices import coverage
 from holdfast.cli.terminal_text import number_ranges
 from holdfast.config.tag_files.write import scale_as_data
 from holdfast.discovery.description import undescribed
+from holdfast.discovery.device_search import UNUSUAL_UNIT, devices
 from holdfast.discovery.segments import FILL_REASONS
 from holdfast.tags.scale import RegisterScale
 from holdfast.values.json import jsonable
@@ -28,7 +29,7 @@ MAX_BITS_SHOWN = 16
 
 
 def units_lines(
-    url: str, asked: Sequence[int], seen: Sequence[Unit], ignores: bool
+    url: str, asked: Sequence[int], seen: Sequence[Unit], alike: Sequence[Unit]
 ) -> Iterator[str]:
     """Which unit ids answer, as text."""
     answering = [each.unit for each in seen if each.answers]
@@ -40,8 +41,23 @@ def units_lines(
         + (f"; invalid replies: {number_ranges(garbled)}" if garbled else "")
         + f"; not asked: {number_ranges(unasked) + ' and ' if unasked else ''}all others"
     )
-    if ignores:
-        yield "It answers every unit id: it probably ignores them. One is described."
+    if alike:
+        is_one = any(each in alike for each in devices(seen, alike))
+        yield f"{ignored_text(seen, alike)} {'One is' if is_one else 'None of them is'} described."
+
+
+def ignored_text(seen: Sequence[Unit], alike: Sequence[Unit]) -> str:
+    """What the unit ids are that answer as a rare one does."""
+    if len(alike) == len(seen):
+        return "The device answers every unit id: it probably ignores them."
+    units = number_ranges(each.unit for each in alike)
+    return f"Unit ids {units} answer as {UNUSUAL_UNIT} does: probably no devices of their own."
+
+
+def ignored_to_json(seen: Sequence[Unit], alike: Sequence[Unit]) -> dict[str, object]:
+    """The same for JSON."""
+    ignores = bool(seen) and len(alike) == len(seen)
+    return {"ignores_unit": ignores, "alike": [each.unit for each in alike]}
 
 
 def _without_answer(seen: Sequence[Unit]) -> tuple[list[int], list[int]]:
@@ -173,7 +189,9 @@ def _shown(each: DescribedTag, raw: object) -> str:
     return f"{text} ({name})" if name else text
 
 
-def units_to_json(asked: Sequence[int], seen: Sequence[Unit], ignores: bool) -> dict[str, object]:
+def units_to_json(
+    asked: Sequence[int], seen: Sequence[Unit], alike: Sequence[Unit]
+) -> dict[str, object]:
     """Which unit ids answer, for JSON."""
     done = [each.unit for each in seen]
     silent, garbled = _without_answer(seen)
@@ -182,7 +200,7 @@ def units_to_json(asked: Sequence[int], seen: Sequence[Unit], ignores: bool) -> 
         "silent": silent,
         "garbled": garbled,
         "not_asked": [unit for unit in asked if unit not in done],
-        "ignores_unit": ignores,
+        **ignored_to_json(seen, alike),
     }
 
 

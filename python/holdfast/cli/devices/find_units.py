@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli import terminal_text
+from holdfast.cli.devices.describe_output import ignored_text, ignored_to_json
 from holdfast.cli.devices.search_report import NOTHING, Report, ended_to_json
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options import device
@@ -43,10 +44,10 @@ def find_units(
     found: list[Unit] = []
     with interruptions() as signals:
         report = Report({"target": url}, signals)
-        ignores = False
+        alike: list[Unit] = []
 
         def search() -> None:
-            nonlocal ignores
+            nonlocal alike
             with report.progress("Finding", len(unit_ids), lambda: f"{_count(found)} found"):
                 for unit in device_search.units(client, unit_ids, delay=delay):
                     with report.held():
@@ -54,18 +55,18 @@ def find_units(
                         if unit.answers:
                             _print(unit, report, is_first=_count(found) == 1)
                         report.advance(len(found))
-                ignores = device_search.ignores_unit(client, found, is_line=is_line, delay=delay)
+                alike = device_search.like_unusual(client, found, is_line=is_line, delay=delay)
 
         with device.connect(url, unit_ids[0], timeout) as client:
             why = report.attempt(search, url, lambda: _count(found))
         not_asked = unit_ids[len(found) :]
-        report.text(*_units(url, found, not_asked, ignores))
+        report.text(*_units(url, found, not_asked, alike))
         report.end(
             {
                 **ended_to_json(why or (None if _count(found) else NOTHING)),
                 "complete": why is None,
                 "garbled": _garbled(found),
-                "ignores_unit": ignores,
+                **ignored_to_json(found, alike),
                 "asked": [each.unit for each in found],
                 "not_asked": list(not_asked),
             }
@@ -102,7 +103,9 @@ def unit_to_json(found: Unit) -> dict[str, object]:
     }
 
 
-def _units(url: str, found: Sequence[Unit], not_asked: Sequence[int], ignores: bool) -> list[str]:
+def _units(
+    url: str, found: Sequence[Unit], not_asked: Sequence[int], alike: Sequence[Unit]
+) -> list[str]:
     """The summary at the end of the search."""
     count = _count(found)
     silent = [each.unit for each in found if not each.answers and not each.is_garbled]
@@ -114,6 +117,6 @@ def _units(url: str, found: Sequence[Unit], not_asked: Sequence[int], ignores: b
         lines.append(f"invalid replies: {number_ranges(garbled)}")
     if not_asked:
         lines.append(f"not asked: {number_ranges(not_asked)}")
-    if ignores:
-        lines.append("The device answers every unit id: it probably ignores them.")
+    if alike:
+        lines.append(ignored_text(found, alike))
     return lines
