@@ -217,7 +217,8 @@ def conclude(found: Description, now: float | None = None, seconds: float | None
             found.reads[each.area, block] = [[found.seen[each.area][at] for at in block]]
     areas = [each.area for each in found.survey.areas]
     if found.sunspec is not None:
-        found.tags += sunspec_tags.tags_of(found.sunspec)
+        [limit] = [each.limit for each in found.survey.areas if each.area == "holding_registers"]
+        found.tags += sunspec_tags.tags_of(found.sunspec, limit)
     for whole in _joined(found):
         if whole.area in BIT_AREAS:
             found.tags += _bits(whole)

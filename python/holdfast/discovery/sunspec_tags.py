@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from holdfast.discovery.described_tag import DescribedTag
-from holdfast.protocol import READ_LIMITS
 from holdfast.tags import Tag
 from holdfast.tags.scale import RegisterScale
 from holdfast.values.types import parsed
@@ -17,17 +16,37 @@ if TYPE_CHECKING:
     from holdfast.discovery.sunspec import Model, Point, SunSpec
 
 
-def tags_of(found: SunSpec) -> Iterator[DescribedTag]:
-    """The points of all models that have a value."""
+def tags_of(found: SunSpec, limit: int) -> Iterator[DescribedTag]:
+    """The points of all models that have a value. One request may be for `limit` registers."""
     names: set[str] = set()
     for model in found.models:
         for point in model.points:
             if point.value is not None:
-                yield _of_point(model, point, names)
+                yield from (_of_point(model, part, names, limit) for part in _parts(point, limit))
 
 
-def _of_point(model: Model, point: Point, names: set[str]) -> DescribedTag:
-    scale, flaw = _scale_of(point)
+def _parts(point: Point, limit: int) -> Iterator[Point]:
+    """A point, in parts that the device returns in one request. Only texts have any."""
+    size = parsed(point.type).registers
+    if point.encoding is None or size <= limit:
+        yield point
+        return
+    content = point.value.encode(point.encoding)
+    # What follows the text is padding.
+    for number, first in enumerate(range(0, -(-len(content) // 2), limit), 1):
+        count = min(limit, size - first)
+        text = content[2 * first : 2 * (first + count)].decode(point.encoding, "replace")
+        yield replace(
+            point,
+            name=f"{point.name}_{number}",
+            address=point.address + first,
+            type=f"string:{2 * count}",
+            value=text,
+        )
+
+
+def _of_point(model: Model, point: Point, names: set[str], limit: int) -> DescribedTag:
+    scale, flaw = _scale_of(point, limit)
     name = _unique(f"{model.name}_{point.name}{'_raw' if flaw else ''}", names)
     text = f"SunSpec model {model.id}"
     if point.label:
@@ -55,7 +74,7 @@ def _of_point(model: Model, point: Point, names: set[str]) -> DescribedTag:
     return DescribedTag(replace(tag, scale=scale), 1.0, (point.value,), (text,), shown=tag)
 
 
-def _scale_of(point: Point) -> tuple[RegisterScale | None, str]:
+def _scale_of(point: Point, limit: int) -> tuple[RegisterScale | None, str]:
     """The register that contains the scale of a point, or why no tag can have it."""
     if point.scaled_at is None:
         return None, ""
@@ -64,7 +83,7 @@ def _scale_of(point: Point) -> tuple[RegisterScale | None, str]:
         min(point.address, point.scaled_at),
         max(point.address + size, point.scaled_at + 1),
     )
-    if last - first > READ_LIMITS["holding_registers"]:
+    if last - first > limit:
         return None, f"which is at {point.scaled_at}, too far to be read with it"
     source = Tag("", "holding_registers", point.scaled_at, "int16")
     return RegisterScale("exponent", source=source), ""
