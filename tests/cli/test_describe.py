@@ -262,7 +262,9 @@ def test_a_silent_device_is_a_failure() -> None:
         found = answer("describe", device.url, *options, code=1)
         result = cli.invoke("describe", device.url, *options)
     assert (found["detail"], found["silent"]) == ("no unit id answered", [1, 2])
-    assert result.stderr == f"holdfast: {device.url}: no unit id answered\n"
+    told, hint = result.stderr.splitlines()
+    assert told == f"holdfast: {device.url}: no unit id answered"
+    assert f"'{device.url}?pause_after_connect=2'" in hint
 
 
 def test_the_description_so_far_is_written_when_it_is_interrupted(tmp_path: Path) -> None:

@@ -274,6 +274,22 @@ def test_a_device_that_ignores_unit_ids_is_told() -> None:
     assert shown[-1] == "The device answers every unit id: it probably ignores them."
 
 
+def test_a_device_that_ignores_what_comes_first_is_found() -> None:
+    def behave(asked: Asked) -> None:
+        if len(host.requests) > 2 and asked.unit == 1:
+            asked.answer(registers(asked.pdu) if asked.pdu[0] == 3 else exception(asked.pdu, 1))
+
+    for command in (("find", "--units", "1-3"), ("find", "--port"), ("describe", "--units", "1-3")):
+        with Stream("tcp", then=behave) as host:
+            name, option, *values = command
+            target = [host.url, option, *values]
+            if option == "--port":
+                address, port = host.url.removeprefix("tcp://").split(":")
+                target = [address, option, port]
+            shown = cli.invoke(name, *target, "--timeout", "0.3").stdout
+        assert "1  answers" in shown or "Unit 1 answers." in shown
+
+
 def test_no_unit_id_is_a_failure() -> None:
     with Stream("tcp", then=silent) as host:
         result = cli.invoke("find", host.url, "--units", "1-2", "--timeout", "0.05")

@@ -134,6 +134,16 @@ def hint_at_late_replies(longest: float, timeout: float) -> None:
     )
 
 
+def hint_at_silence(url: str) -> None:
+    """Says what may help if a device at a URL accepts connections and answers no unit id."""
+    if "pause_after_connect" not in url and not answers.wanted():
+        click.echo(
+            "hint: some devices ignore what comes in the first seconds after connecting: "
+            f"'{url}{'&' if '?' in url else '?'}pause_after_connect=2' waits for them",
+            err=True,
+        )
+
+
 def fail(
     error: object,
     url: str,

@@ -174,8 +174,8 @@ async def _host(address: str, port: int, timeout: float, units: Sequence[int]) -
 
 
 async def _ask(host: Host, client: Client, units: Sequence[int]) -> None:
-    """Asks unit ids until one answers, and notes in `host` what was found."""
-    for unit in units:
+    """Asks unit ids until one answers, as `units`, and notes in `host` what was found."""
+    for unit in (*units[:2], *units[:1], *units[2:]):
         try:
             await client.read("holding_registers", 0, "uint16", unit=unit)
             host.detail = ANSWERS
@@ -208,12 +208,25 @@ def _unreachable(error: ConnectFailed) -> State:
     return "refused" if isinstance(error.__cause__, ConnectionRefusedError) else "silent"
 
 
-def units(client: SyncClient, unit_ids: Iterable[int], *, delay: float = 0.0) -> Iterator[Unit]:
-    """Asks unit ids one by one, and yields each. Raises `ConnectFailed`."""
-    for count, unit in enumerate(unit_ids):
-        if count:
+def units(client: SyncClient, unit_ids: Sequence[int], *, delay: float = 0.0) -> Iterator[Unit]:
+    """Asks unit ids one by one, and yields each. Raises `ConnectFailed`.
+
+    If the first two do not reply, the first is asked once more: some devices ignore what comes soon
+    after connecting, and after three timeouts the connection is another one. It is yielded again
+    if it answers.
+    """
+    is_silent = True
+    for count, unit in enumerate(unit_ids, 1):
+        if count > 1:
             pause(delay)
-        yield probe(client, unit, delay=delay)
+        found = probe(client, unit, delay=delay)
+        is_silent = is_silent and not found.answers and not found.is_garbled
+        yield found
+        if is_silent and count == min(2, len(unit_ids)):
+            pause(delay)
+            found = probe(client, unit_ids[0], delay=delay)
+            if found.answers:
+                yield found
 
 
 def probe(client: SyncClient, unit: int, *, delay: float = 0.0) -> Unit:

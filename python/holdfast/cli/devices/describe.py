@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from holdfast.cli import CommandWithSubcommands, complete_subcommand
+from holdfast.cli import CommandWithSubcommands, complete_subcommand, device_errors
 from holdfast.cli.devices.describe_output import (
     described_lines,
     head_lines,
@@ -59,6 +59,8 @@ _UNITS_HELP = (
 )
 MAX_LINES = 60
 """The most lines of tags in the text; a file and JSON have all tags."""
+
+NO_UNIT = Ended("nothing", "no unit id answered")
 
 INFERENCE_S = 2
 """The time for what was found when a signal has ended the search."""
@@ -154,9 +156,14 @@ def describe(
         run = _Run(url, asked, settings, times, every, output, force, most, report)
         with device.connect(url, asked[0], timeout) as client:
             why = run.carry_out(client, is_line=is_line)
+            is_silent = why is NO_UNIT and not (is_line or run.is_garbled or client.longest_late)
         run.end(why)
-    if why is not None:
-        fail(f"{url}: {why}", is_printed=as_json)
+    try:
+        if why is not None:
+            fail(f"{url}: {why}", is_printed=as_json)
+    finally:
+        if is_silent:
+            device_errors.hint_at_silence(url)
 
 
 @dataclass
@@ -176,12 +183,21 @@ class _Run:
     report: Report
 
     def __post_init__(self) -> None:
-        self._seen: list[Unit] = []
+        self._by_unit: dict[int, Unit] = {}
         self._alike: list[Unit] = []
         self._found: list[Description] = []
         self._files: list[str] = []
         self._unwritten: Ended | None = None
         """The error of the first file that could not be written."""
+
+    @property
+    def _seen(self) -> list[Unit]:
+        return list(self._by_unit.values())
+
+    @property
+    def is_garbled(self) -> bool:
+        """Whether a unit id sent invalid replies."""
+        return any(each.is_garbled for each in self._seen)
 
     @property
     def _answering(self) -> list[Unit]:
@@ -218,7 +234,7 @@ class _Run:
             return replace(why, detail=f"{why}; {unwritten}")
         if why is not None:
             return why
-        return unwritten if self._found else Ended("nothing", "no unit id answered")
+        return unwritten if self._found else NO_UNIT
 
     def end(self, why: Ended | None) -> None:
         """Prints what is known when the search has ended."""
@@ -243,7 +259,7 @@ class _Run:
         with self.report.progress("Asking", len(asked), lambda: ""):
             for unit in device_search.units(client, asked, delay=delay):
                 with self.report.held():
-                    self._seen.append(unit)
+                    self._by_unit[unit.unit] = unit
                     self.report.advance(len(self._seen))
                     if unit.answers:
                         self.report.text(f"Unit {unit.unit} answers.")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from holdfast.cli import terminal_text
-from holdfast.cli.device_errors import hint_at_late_replies
+from holdfast.cli.device_errors import hint_at_late_replies, hint_at_silence
 from holdfast.cli.devices.search_report import INTERRUPTED, NOTHING, Report, ended_to_json
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.discovery import device_search
@@ -104,7 +104,10 @@ def find_hosts(
     )
     if interrupted and not as_json:
         click.echo("holdfast: interrupted", err=True)
-    hint_at_late_replies(max((host.longest_late for host in found), default=0.0), timeout)
+    latest = max((host.longest_late for host in found), default=0.0)
+    hint_at_late_replies(latest, timeout)
+    if listed and not latest and not interrupted and not counts["modbus"]:
+        hint_at_silence(listed[0].url)
     if interrupted or not counts["modbus"]:
         sys.exit(ExitCode.FAILED)
 
