@@ -79,7 +79,8 @@ def test_every_unit_id_has_a_file(plant: str, tmp_path: Path) -> None:
     assert found["not_described"] == []
     first, second = found["units"]
     assert first["sunspec"] is None
-    assert [model["id"] for model in second["sunspec"]["models"]] == [1, 103]
+    models = second["sunspec"]["models"]
+    assert [(model["id"], model["without_value"]) for model in models] == [(1, 1), (103, 13)]
     assert second["areas"]["holding_registers"]["exist"] == 130
     current = next(tag for tag in second["tags"] if tag["name"] == "inverter_three_phase_A")
     place = {"area": "holding_registers", "address": 40076, "type": "int16"}
@@ -205,6 +206,13 @@ def sunspec_from_0(pdu: bytes) -> bytes:
     if first + count > len(content):
         return exception(pdu, 2)
     return bytes([3, 2 * count]) + struct.pack(f">{count}H", *content[first : first + count])
+
+
+def test_points_without_a_value_are_counted() -> None:
+    with FakeDevice(sunspec_from_0) as device:
+        shown = done("describe", device.url, "--units", "1", *QUICK, "--range", "0-200")
+    [told] = [line for line in shown if line.startswith("Points without a value")]
+    assert "of model 103. Describe the device while it works." in told
 
 
 def test_range_quantity_and_delay_are_those_of_every_request(

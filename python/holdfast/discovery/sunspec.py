@@ -116,6 +116,11 @@ class Model:
     points: tuple[Point, ...]
 
     @property
+    def without_value(self) -> int:
+        """How many points have no value: the device never has it, or not in its present state."""
+        return sum(point.value is None for point in self.points)
+
+    @property
     def stop(self) -> int:
         """The address behind the model."""
         return self.address + 2 + self.length

@@ -78,6 +78,16 @@ def head_lines(found: Description) -> list[str]:
         flaw = found.sunspec.flaw
         end = "" if flaw is None else f"; the end of the models was not found: {flaw}"
         lines.append(f"SunSpec at {found.sunspec.base}: models {models or 'none'}{end}")
+        left = [
+            f"{each.without_value} of model {each.id}"
+            for each in found.sunspec.models
+            if each.without_value
+        ]
+        if left:
+            lines.append(
+                f"Points without a value now have no tag: {', '.join(left)}. "
+                "Describe the device while it works."
+            )
     return lines
 
 
@@ -211,7 +221,13 @@ def sunspec_to_json(found: SunSpec) -> dict[str, object]:
         "complete": found.is_complete,
         "flaw": found.flaw,
         "models": [
-            {"id": each.id, "name": each.name, "address": each.address, "length": each.length}
+            {
+                "id": each.id,
+                "name": each.name,
+                "address": each.address,
+                "length": each.length,
+                "without_value": each.without_value,
+            }
             for each in found.models
         ],
     }
