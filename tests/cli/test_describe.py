@@ -83,9 +83,10 @@ def test_every_unit_id_has_a_file(plant: str, tmp_path: Path) -> None:
     assert [(model["id"], model["without_value"]) for model in models] == [(1, 1), (103, 13)]
     assert second["areas"]["holding_registers"]["exist"] == 130
     current = next(tag for tag in second["tags"] if tag["name"] == "inverter_three_phase_A")
-    place = {"area": "holding_registers", "address": 40076, "type": "int16"}
     assert (current["values"], current["confidence"]) == ([215], 1.0)
-    assert current["scale"] == {"from": place, "as": "exponent"}
+    factor = "inverter_three_phase_A_SF"
+    assert current["scale"] == {"from": factor, "as": "exponent"}
+    assert [each["values"] for each in second["tags"] if each["name"] == factor] == [[-1]]
     again = ("describe", plant, "--units", "1-4", *QUICK, "--output", str(file))
     edited = tmp_path / "device-unit1.csv"
     edited.write_text("by hand")

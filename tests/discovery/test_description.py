@@ -178,7 +178,8 @@ def test_a_scale_factor_that_is_too_far_leaves_the_raw_number() -> None:
     spec = sunspec.SunSpec(0, (model,))
     found = Description(1, Survey(["holding_registers"]), sunspec=spec)
     description.conclude(found)
-    first, second = (each.tag for each in found.tags)
+    factor, first, second = (each.tag for each in found.tags)
+    assert (factor.name, factor.address, factor.scale) == ("mppt_X_SF", 40, 1)
     assert (first.name, first.unit, first.span) == ("mppt_near", "W", range(40, 165))
     assert (second.name, second.unit, second.scale) == ("mppt_far_raw", "", 1)
     assert "no scale from X_SF, which is at 40" in second.description

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,18 +12,33 @@ from holdfast.tags.scale import RegisterScale
 from holdfast.values.types import parsed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from holdfast.discovery.sunspec import Model, Point, SunSpec
 
 
 def tags_of(found: SunSpec, limit: int) -> Iterator[DescribedTag]:
-    """The points of all models that have a value. One request may be for `limit` registers."""
+    """The points of all models that have a value, and their scale factors. One request may be for
+    `limit` registers.
+    """
     names: set[str] = set()
     for model in found.models:
+        factors: dict[int, str] = {}
         for point in model.points:
-            if point.value is not None:
-                yield from (_of_point(model, part, names, limit) for part in _parts(point, limit))
+            if point.value is None:
+                continue
+            if point.scaled_at is not None and point.scaled_at not in factors:
+                factors[point.scaled_at] = _unique(f"{model.name}_{point.scaled_by}", names)
+                yield _factor(model, point, factors[point.scaled_at], point.scaled_at)
+            for part in _parts(point, limit):
+                yield _of_point(model, part, names, limit, factors)
+
+
+def _factor(model: Model, point: Point, name: str, address: int) -> DescribedTag:
+    """The tag of a scale factor: a recording without it can't be played back."""
+    text = f"SunSpec model {model.id}, scale factor"
+    tag = Tag(name, "holding_registers", address, "int16", description=text)
+    return DescribedTag(tag, 1.0, (round(math.log10(point.scale)),), (text,))
 
 
 def _parts(point: Point, limit: int) -> Iterator[Point]:
@@ -45,8 +61,10 @@ def _parts(point: Point, limit: int) -> Iterator[Point]:
         )
 
 
-def _of_point(model: Model, point: Point, names: set[str], limit: int) -> DescribedTag:
-    scale, flaw = _scale_of(point, limit)
+def _of_point(
+    model: Model, point: Point, names: set[str], limit: int, factors: Mapping[int, str]
+) -> DescribedTag:
+    scale, flaw = _scale_of(point, limit, factors)
     name = _unique(f"{model.name}_{point.name}{'_raw' if flaw else ''}", names)
     text = f"SunSpec model {model.id}"
     if point.label:
@@ -74,7 +92,9 @@ def _of_point(model: Model, point: Point, names: set[str], limit: int) -> Descri
     return DescribedTag(replace(tag, scale=scale), 1.0, (point.value,), (text,), shown=tag)
 
 
-def _scale_of(point: Point, limit: int) -> tuple[RegisterScale | None, str]:
+def _scale_of(
+    point: Point, limit: int, factors: Mapping[int, str]
+) -> tuple[RegisterScale | None, str]:
     """The register that contains the scale of a point, or why no tag can have it."""
     if point.scaled_at is None:
         return None, ""
@@ -85,8 +105,9 @@ def _scale_of(point: Point, limit: int) -> tuple[RegisterScale | None, str]:
     )
     if last - first > limit:
         return None, f"which is at {point.scaled_at}, too far to be read with it"
-    source = Tag("", "holding_registers", point.scaled_at, "int16")
-    return RegisterScale("exponent", source=source), ""
+    name = factors[point.scaled_at]
+    source = Tag(name, "holding_registers", point.scaled_at, "int16")
+    return RegisterScale("exponent", name, source), ""
 
 
 def _unique(name: str, names: set[str]) -> str:
