@@ -232,7 +232,7 @@ def test_range_quantity_and_delay_are_those_of_every_request(
     [unit] = found["units"]
     assert [each["id"] for each in unit["sunspec"]["models"]] == [1]
     ends = {each["name"]: each["address"] for each in unit["tags"]}
-    assert ends["common_Mn"] == 4
+    assert ends["common_Mn_1"] == 4
     assert max(ends.values()) < 80
 
 
