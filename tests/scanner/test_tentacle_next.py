@@ -246,12 +246,15 @@ def lost(caplog: pytest.LogCaptureFixture) -> set[tuple[str, int]]:
     return {(each["bucket"], each["keys"]) for each in logged(caplog, "bucket_lost")}
 
 
+@pytest.mark.parametrize("is_made_again", [True, False])
 def test_a_lost_bucket_neither_ends_subscriptions_nor_enables_the_scanner(
     run_scanner: Run,
     own_nats: NatsServer,
     own_caller: Caller,
     server: holdfast.Server,
     caplog: pytest.LogCaptureFixture,
+    *,
+    is_made_again: bool,
 ) -> None:
     running = run_scanner(own_nats, **NEXT)
     for device in ("a", "b"):
@@ -261,10 +264,14 @@ def test_a_lost_bucket_neither_ends_subscriptions_nor_enables_the_scanner(
     wire.until(lambda: devices(own_caller).keys() == {"a", "b"}, "both are subscribed")
     wire.until(lambda: logged(caplog, "scanner_disabled") != [], "it is disabled")
 
-    for loses in (own_nats.lose_store, lambda: None):  # Nor when it is read once more.
+    if not is_made_again:  # It is the same one, and its numbers go on.
+        for bucket in (BUCKET, ENABLED):
+            own_caller.do(own_caller.client.jetstream().purge_stream(f"KV_{bucket}"))
+    for loses in (is_made_again, False):  # Nor when it is read once more.
         own_nats.kill()
         wire.until(lambda: not running.serves, "the connection is lost")
-        loses()
+        if loses:
+            own_nats.lose_store()
         own_nats.start()
         wire.until(lambda: running.serves, "it is connected again")
         own_caller.put(BUCKET, key("c"), gateway_entry(server, gateway_tag("c", 0), device="c"))

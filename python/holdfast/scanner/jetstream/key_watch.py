@@ -89,7 +89,8 @@ class KeyWatch:
         """`keys` is a key, or `>` for all.
 
         `on_change` gets what keys have, `None` for a deleted one: at first all keys, then each
-        change, and all keys again whenever this starts again.
+        change, and all keys again whenever this starts again. A key that is only missing is not
+        deleted: the server has lost it.
         """
         self._bucket = bucket
         self._keys = keys
@@ -97,12 +98,8 @@ class KeyWatch:
         self._times = times
         self._client: Client | None = None
         self._has_new_client = asyncio.Event()
-        self._made_at = ""
-        """When the bucket was made; empty until it is known."""
-        self._latest = 0
-        """The number of its latest message that is known."""
         self._known: set[str] = set()
-        """The keys that it has, as far as they are reported."""
+        """The keys that the bucket has, as far as it is known."""
         events = "bucket_watched", "bucket_not_watched"
         self._availability = Availability(*events, bucket=bucket)
         self._backoff = Backoff(FIRST_RETRY_S, times.retry_s, jitter=True)
@@ -154,38 +151,27 @@ class KeyWatch:
         await self._open(jetstream)
         async with reading(jetstream, self._bucket, self._keys) as reader:
             found = await reader.fetch_all()
-            deleted: dict[str, Written | None] = dict.fromkeys(self._known - found.keys())
-            await self._report(deleted | found, reader.latest)
+            if lost := len(self._known - found.keys()):
+                log_lines.write(logging.WARNING, "bucket_lost", bucket=self._bucket, keys=lost)
+                self._known.clear()
+            await self._report(found)
             self._backoff.succeeded()
             self._availability.succeeded()
             self.tried.set()
             while True:
                 if changes := await reader.changes(self._times):
-                    await self._report(changes, reader.latest)
+                    await self._report(changes)
 
-    async def _report(self, changes: Mapping[str, Written | None], latest: int) -> None:
-        self._latest = max(self._latest, latest)
-        # After an error, the deleted keys are reported again.
+    async def _report(self, changes: Mapping[str, Written | None]) -> None:
+        self._known -= changes.keys()
         self._known |= {key for key, written in changes.items() if written is not None}
         await self._on_change(changes)
-        self._known -= {key for key, written in changes.items() if written is None}
 
     async def _open(self, jetstream: JetStreamContext) -> None:
-        """Makes the bucket, if it is missing. Notes that it is another one, or was set back."""
-        stream = f"KV_{self._bucket}"
         try:
-            info = await jetstream.stream_info(stream)
+            await jetstream.stream_info(f"KV_{self._bucket}")
         except NotFoundError:
             await jetstream.create_key_value(bucket=self._bucket, history=1)
-            info = await jetstream.stream_info(stream)
-        before, self._made_at = self._made_at, str(info.created)
-        if before in ("", self._made_at) and info.state.last_seq >= self._latest:
-            return
-        self._latest = 0
-        if self._known:
-            keys = len(self._known)
-            log_lines.write(logging.WARNING, "bucket_lost", bucket=self._bucket, keys=keys)
-        self._known.clear()
 
 
 class Reader:
@@ -203,11 +189,9 @@ class Reader:
         self._consumer = consumer
         self._received = 0
         """The number of the last message, counted by the server."""
-        self.latest = 0
-        """The greatest number that a message of the bucket has had."""
 
     async def fetch_all(self) -> dict[str, Written | None]:
-        """Returns all keys that there are now."""
+        """Returns all keys that there are now, the deleted ones too."""
         info = await self._consumer.consumer_info()
         self._name, count = info.name, info.num_pending or 0
         found: dict[str, Written | None] = {}
@@ -241,7 +225,6 @@ class Reader:
         is_marker = any(header in headers for header in MARKER_HEADERS)
         key = message.subject.removeprefix(f"$KV.{self._bucket}.")
         revision = message.metadata.sequence.stream
-        self.latest = max(self.latest, revision)
         return key, None if is_marker else Written(message.data, revision)
 
     async def _check(self) -> None:
