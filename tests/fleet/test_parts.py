@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 import pytest
@@ -15,12 +15,15 @@ from holdfast.net.nats import batch
 from holdfast.net.nats.connection import Servers
 from holdfast.net.nats.outbox import Outbox
 from holdfast.scanner.errors import Moved
-from holdfast.scanner.fleet import desired_state, nodes
+from holdfast.scanner.fleet import desired_state, nodes, observer, questions
 from holdfast.scanner.fleet.agreement import Terms
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
 from holdfast.scanner.fleet.nodes import Executed, OtherNodes
+from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
+from holdfast.scanner.messages.types import Answer
 from holdfast.scanner.settings import FleetSettings, Settings
 from holdfast.tags import Tag, TagList
+from support.nats_bus import logged
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -223,3 +226,48 @@ def test_commands_that_wait_for_a_node_are_carried_out_in_order(
     monkeypatch.setattr(nodes, "ask", ask)
     asyncio.run(work())
     assert written == ["0", "2", "3", "4"]
+
+
+def test_what_is_no_answer_is_skipped(caplog: pytest.LogCaptureFixture) -> None:
+    done: list[str] = []
+    confirmation, malformed = b'{"stream":"recorded","seq":1}', b'{"success":1}'
+    received = [confirmation, malformed, b'{"success":true}']
+
+    class Connected:
+        """As much of a client as is asked for."""
+
+        def new_inbox(self) -> str:
+            return "inbox"
+
+        async def subscribe(self, _: str) -> Connected:
+            done.append("subscribed")
+            return self
+
+        async def unsubscribe(self) -> None:
+            done.append("unsubscribed")
+
+        async def publish(self, *_: object, reply: str) -> None:
+            done.append(f"published for {reply}")
+
+        async def next_msg(self, _: None) -> SimpleNamespace:
+            done.append("waited")
+            return SimpleNamespace(headers=None, data=received.pop(0))
+
+    client: Any = Connected()
+    asking = questions.ask(client, "modbus.fleet.b.drain", b"", Answer, 10.0)
+    assert asyncio.run(asking).success
+    waited = ["waited"] * 3
+    assert done == ["subscribed", "published for inbox", *waited, "unsubscribed"]
+    [fields] = logged(caplog, "message_malformed")
+    assert fields["subject"] == "modbus.fleet.b.drain"
+
+
+def test_a_node_that_refuses_to_leave_does_not_leave(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def ask(*_: object) -> Answer:
+        return Answer(success=False, error="it is busy")
+
+    monkeypatch.setattr(observer, "ask", ask)
+    looker = FleetObserver("plant", Servers())
+    looker._client = cast("Any", SimpleNamespace(is_connected=True))
+    with pytest.raises(FleetUnavailable, match="node a does not leave: it is busy"):
+        asyncio.run(looker.drain("a", "modbus"))

@@ -178,6 +178,8 @@ class OtherNodes:
             return f"{device.id} moves from node {owner.node} to another one"
         if done.error is not None:
             raise (NotConfirmed if done.not_confirmed else Refused)(done.error)
+        if not done.success:
+            raise NotConfirmed(f"not confirmed: node {owner.node} gives no reason")
         return None
 
     async def reports(

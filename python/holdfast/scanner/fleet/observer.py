@@ -147,7 +147,8 @@ class FleetObserver:
         """Has a node leave. Raises `FleetUnavailable` if it does not."""
         is_known = node in (await self.look()).nodes
         try:
-            await ask(self._client, subject(prefix, node, "drain"), b"", Answer, ANSWERING)
+            where = subject(prefix, node, "drain")
+            answer = await ask(self._client, where, b"", Answer, ANSWERING)
         except (Error, OSError) as error:
             # A stream that records the subject is a responder, also if there is no such node.
             if isinstance(error, NoRespondersError if is_known else (NoRespondersError, NoAnswer)):
@@ -155,6 +156,8 @@ class FleetObserver:
             else:
                 flaw = f"node {node} does not answer: {nats_reason(error)}"
             raise FleetUnavailable(flaw) from None
+        if not answer.success:
+            raise FleetUnavailable(f"node {node} does not leave: {answer.error}")
         end = time.monotonic() + LEAVE_TIMEOUT_S
         while node in (await self.look()).nodes:
             await asyncio.sleep(CHECK_INTERVAL_S)

@@ -12,7 +12,8 @@ from nats.errors import Error, NoRespondersError
 from nats.errors import TimeoutError as NoAnswer
 from nats.js.api import Header
 
-from holdfast.runtime.malformed_json import MALFORMED_JSON
+from holdfast.events import log_lines
+from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.messages.types import Answer
 
 if TYPE_CHECKING:
@@ -24,6 +25,12 @@ Reply = TypeVar("Reply", bound=Answer)
 def subject(prefix: str, node: str, what: str, process: str = "") -> str:
     """Where a node is asked; with `process`, only that one: two may have the same name."""
     return ".".join((prefix, "fleet", node, *([process] if process else []), what))
+
+
+class _Confirmation(msgspec.Struct):
+    """What a stream of JetStream sends that records a subject."""
+
+    stream: str
 
 
 async def ask(
@@ -44,10 +51,20 @@ async def ask(
                 message = await messages.next_msg(None)
                 if (message.headers or {}).get(Header.STATUS) == NO_RESPONDERS_STATUS:
                     raise NoRespondersError
-                with contextlib.suppress(*MALFORMED_JSON):
+                try:
                     return msgspec.json.decode(message.data, type=kind)
+                except MALFORMED_JSON as error:
+                    _note(where, message.data, malformed_text(error))
     except TimeoutError:
         raise NoAnswer from None
     finally:
         with contextlib.suppress(Error):  # The connection was closed.
             await messages.unsubscribe()
+
+
+def _note(where: str, answer: bytes, reason: str) -> None:
+    """Logs what is not an answer, unless it is the confirmation of a stream."""
+    try:
+        msgspec.json.decode(answer, type=_Confirmation)
+    except MALFORMED_JSON:
+        log_lines.refused("message_malformed", kind="answer", subject=where, reason=reason)
