@@ -14,9 +14,11 @@ from nats.errors import TimeoutError as NoAnswer
 from holdfast.net.nats import batch
 from holdfast.net.nats.connection import Servers
 from holdfast.net.nats.outbox import Outbox
-from holdfast.scanner.errors import Moved
+from holdfast.replication.leases.times import LeaseTimes
+from holdfast.scanner.errors import Moved, NotConfirmed, Refused
 from holdfast.scanner.fleet import desired_state, nodes, observer, questions
 from holdfast.scanner.fleet.agreement import Terms
+from holdfast.scanner.fleet.command_order import CommandOrder
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
 from holdfast.scanner.fleet.nodes import Executed, OtherNodes
 from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
@@ -172,60 +174,190 @@ def test_an_attempt_to_restore_ends_before_the_next_one(monkeypatch: pytest.Monk
     asyncio.run(work())
 
 
-@pytest.mark.parametrize("becomes_own", [True, False])
-def test_commands_that_wait_for_a_node_are_carried_out_in_order(
-    monkeypatch: pytest.MonkeyPatch, *, becomes_own: bool
-) -> None:
-    written: list[str] = []
-    sent_back = {"0"}
+class Move:
+    """A node whose commands a device carries out, or that come back; `is_own`: in this process."""
 
-    async def is_moved(text: str) -> bool:
-        if text not in sent_back:
-            written.append(text)
-            return False
-        sent_back.clear()
-        for _turn in range(20):
-            await asyncio.sleep(0)
-        return True
-
-    async def ask(_: object, __: str, question: bytes, *___: object) -> Executed:
-        moved = await is_moved(msgspec.json.decode(question)["text"])
-        return Executed(success=not moved, moved=moved)
-
-    async def work() -> None:
-        has_node = False
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *, is_own: bool) -> None:
+        self.has_node = True
+        self.answers: dict[str, asyncio.Future[Executed]] = {}
+        """The commands that are on their way, and what will answer them."""
+        self.moves = True
+        self.written: list[str] = []
+        monkeypatch.setattr(nodes, "ask", self._ask)
+        other = SimpleNamespace(node="b", process="")
         fleet = SimpleNamespace(
-            settings=FleetSettings("plant", "a", 16),
+            # No command waits for longer than this for a node.
+            settings=FleetSettings("plant", "a", 16, LeaseTimes(3e-8, 2e-8, 1e-8)),
             leases=SimpleNamespace(seen={}),
-            holder=lambda _: SimpleNamespace(node="b", process="") if has_node else None,
+            holder=lambda _: other if self.has_node else None,
             is_other=lambda _: True,
         )
         member: Any = SimpleNamespace(
             fleet=fleet,
             client=object(),
             known=lambda device: device,
-            is_own=lambda _: has_node and becomes_own,
+            is_own=lambda _: self.has_node and is_own,
         )
-        device: Any = SimpleNamespace(id="d", partition=0, source=SimpleNamespace(timeout=500))
-        others = OtherNodes("modbus", member)
+        self._device: Any = SimpleNamespace(
+            id="d", partition=0, source=SimpleNamespace(timeout=500)
+        )
+        self._others = OtherNodes("modbus", member)
 
-        async def write(text: str) -> None:
-            async def own(last_moment: Callable[[], float]) -> None:
-                if await is_moved(text):
-                    raise Moved
-                last_moment()
+    def begin(self, text: str) -> asyncio.Task[None]:
+        """Sends a command."""
 
-            await others.write(device, "t", text, own, lambda: 10.0)
+        async def own(last_moment: Callable[[], float]) -> None:
+            for _turn in range(20):  # Its subscriptions are read.
+                await asyncio.sleep(0)
+            last_moment()
+            if (await self._answer(text)).moved:
+                raise Moved
 
-        commands = [asyncio.create_task(write(text)) for text in "0123"]
+        write = self._others.write(self._device, "t", text, own, lambda: 10.0)
+        return asyncio.create_task(write)
+
+    async def _ask(
+        self,
+        _: object,
+        __: str,
+        question: bytes,
+        ___: object,
+        ____: float,
+        sent: Callable[[], None],
+    ) -> Executed:
+        for _turn in range(20):  # It subscribes to the answer.
+            await asyncio.sleep(0)
+        sent()
+        return await self._answer(msgspec.json.decode(question)["text"])
+
+    async def _answer(self, text: str) -> Executed:
+        executed = CARRIED_OUT
+        if self.moves:
+            answer = self.answers[text] = asyncio.get_running_loop().create_future()
+            executed = await answer
+        if executed.success:
+            self.written.append(text)
+        return executed
+
+    async def until_on_their_way(self, count: int) -> None:
+        """Waits for so many commands."""
+        async with asyncio.timeout(10):
+            while len(self.answers) < count:
+                await asyncio.sleep(0)
+
+
+MOVED = Executed(success=False, moved=True)
+CARRIED_OUT = Executed(success=True)
+
+
+@pytest.mark.parametrize("is_own", [True, False])
+def test_commands_that_come_back_are_carried_out_in_order(
+    monkeypatch: pytest.MonkeyPatch, *, is_own: bool
+) -> None:
+    async def work() -> None:
+        commands = [move.begin(text) for text in "012345"]
+        await move.until_on_their_way(6)
+        move.moves = False
+        for text in "543210":
+            move.answers[text].set_result(MOVED)
+            await asyncio.sleep(0)
+        await asyncio.gather(*commands, move.begin("6"))
+
+    move = Move(monkeypatch, is_own=is_own)
+    asyncio.run(work())
+    assert move.written == ["0", "1", "2", "3", "4", "5", "6"]
+
+
+@pytest.mark.parametrize("is_own", [True, False])
+def test_a_command_that_comes_back_is_not_written_after_a_later_one(
+    monkeypatch: pytest.MonkeyPatch, *, is_own: bool
+) -> None:
+    async def work() -> None:
+        first, second = move.begin("0"), move.begin("1")
+        await move.until_on_their_way(2)
+        move.answers.pop("0").set_result(MOVED)
+        for _turn in range(100):
+            await asyncio.sleep(0)
+        assert move.answers.keys() == {"1"}, "it waits: the later one may come back, too"
+        move.moves = False
+        move.answers["1"].set_result(CARRIED_OUT)
+        await second
+        with pytest.raises(Refused, match="a later command to d went before it; send it again"):
+            await first
+
+    monkeypatch.setattr(nodes, "RETRY_S", 0.0)
+    move = Move(monkeypatch, is_own=is_own)
+    asyncio.run(work())
+    assert move.written == ["1"]
+
+
+def test_the_next_command_waits_for_the_answer_of_one_that_came_back(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def work() -> None:
+        commands = [move.begin(text) for text in "01"]
+        await move.until_on_their_way(2)
+        for text in "01":
+            move.answers.pop(text).set_result(MOVED)
+        await move.until_on_their_way(1)
+        for _turn in range(100):
+            await asyncio.sleep(0)
+        assert move.answers.keys() == {"0"}, "it may come back again"
+        move.moves = False
+        move.answers["0"].set_result(CARRIED_OUT)
+        await asyncio.gather(*commands)
+
+    monkeypatch.setattr(nodes, "RETRY_S", 0.0)
+    move = Move(monkeypatch, is_own=False)
+    asyncio.run(work())
+    assert move.written == ["0", "1"]
+
+
+def test_commands_that_wait_for_a_node_are_carried_out_in_order(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def work() -> None:
+        commands = [move.begin(text) for text in "0123"]
         await asyncio.sleep(0)
         commands.pop(1).cancel()
-        has_node = True
-        await asyncio.gather(*commands, write("4"))
+        move.has_node, move.moves = True, False
+        await asyncio.gather(*commands, move.begin("4"))
 
-    monkeypatch.setattr(nodes, "ask", ask)
+    move = Move(monkeypatch, is_own=True)
+    move.has_node = False
     asyncio.run(work())
-    assert written == ["0", "2", "3", "4"]
+    assert move.written == ["0", "2", "3", "4"]
+
+
+def test_a_burst_of_commands_is_ordered_with_few_comparisons() -> None:
+    class Number(int):
+        """One whose comparisons are counted."""
+
+        def __lt__(self, other: int) -> bool:
+            compared.append(self)
+            return int(self) < other
+
+    compared: list[int] = []
+    order, numbers = CommandOrder(), [Number(number) for number in range(1000)]
+    for number in numbers:
+        order.wait(number)
+    for number in numbers:
+        assert order.take(number)
+        order.release(number)
+        order.end(number)
+    assert len(compared) < 100 * len(numbers)
+
+
+def test_a_command_without_success_is_not_carried_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def work() -> None:
+        command = move.begin("0")
+        await move.until_on_their_way(1)
+        move.answers["0"].set_result(Executed(success=False))
+        with pytest.raises(NotConfirmed, match="node b gives no reason"):
+            await command
+
+    move = Move(monkeypatch, is_own=False)
+    asyncio.run(work())
 
 
 def test_what_is_no_answer_is_skipped(caplog: pytest.LogCaptureFixture) -> None:
@@ -253,11 +385,14 @@ def test_what_is_no_answer_is_skipped(caplog: pytest.LogCaptureFixture) -> None:
             done.append("waited")
             return SimpleNamespace(headers=None, data=received.pop(0))
 
+    def sent() -> None:
+        done.append("sent")
+
     client: Any = Connected()
-    asking = questions.ask(client, "modbus.fleet.b.drain", b"", Answer, 10.0)
+    asking = questions.ask(client, "modbus.fleet.b.drain", b"", Answer, 10.0, sent)
     assert asyncio.run(asking).success
     waited = ["waited"] * 3
-    assert done == ["subscribed", "published for inbox", *waited, "unsubscribed"]
+    assert done == ["subscribed", "published for inbox", "sent", *waited, "unsubscribed"]
     [fields] = logged(caplog, "message_malformed")
     assert fields["subject"] == "modbus.fleet.b.drain"
 

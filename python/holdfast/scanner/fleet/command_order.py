@@ -1,37 +1,65 @@
-"""Which of the commands that wait for the node of a device goes first."""
+"""Which of the commands to a device goes next to the node that polls it."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
+from bisect import bisect_left, insort
+from operator import itemgetter
+
+_NUMBER = itemgetter(0)
 
 
-class WaitingCommands:
-    """The commands to one device that no node has yet, by number. The lowest number goes first.
+class CommandOrder:
+    """The commands to one device, by number, in the order in which they were received.
 
-    A command that comes back because the device has moved joins again with its number, so it goes
-    before those that were received after it.
+    One at a time has the turn, until it is on its way to the device; the others wait in order. One
+    that comes back, because the device has moved, waits again. It also waits for later ones that
+    are on their way: they come back, too, or it is overtaken and must not be written any more.
     """
 
     def __init__(self) -> None:
-        self._changed: dict[int, asyncio.Event] = {}
-        """For each command, the event that it may be the first one now."""
+        self._waiting: list[tuple[int, asyncio.Event]] = []
+        """In order, with the event that it may have the turn."""
+        self._turn: int | None = None
+        self._going: dict[int, None] = {}
+        """Those that have or had the turn, until they come back or end. In order: what is added is
+        later than all of them."""
+        self._last_ended = -1
 
-    def join(self, number: int) -> None:
-        """Adds a command, unless it waits already."""
-        self._changed.setdefault(number, asyncio.Event())
+    def wait(self, number: int) -> asyncio.Event:
+        """Adds a command, also one that comes back. Returns the event that it may have the turn."""
+        changed = asyncio.Event()
+        insort(self._waiting, (number, changed), key=_NUMBER)
+        self._going.pop(number, None)
+        self.release(number)
+        return changed
 
-    def leave(self, number: int) -> None:
-        """Removes a command, if it waits: a node has it, or it is refused."""
-        if self._changed.pop(number, None) is not None and self._changed:
-            self._changed[min(self._changed)].set()
+    def take(self, number: int) -> bool:
+        """Takes the turn. Returns whether this command has it now."""
+        is_next = self._waiting[0][0] == number > next(reversed(self._going), -1)
+        if self._turn is not None or not is_next:
+            return False
+        del self._waiting[0]
+        self._going[number] = None
+        self._turn = number
+        return True
 
-    async def turn(self, number: int, seconds: float) -> bool:
-        """Waits until a command is the first one. Returns whether it is, within this time."""
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(seconds):
-                while min(self._changed) < number:
-                    changed = self._changed[number] = asyncio.Event()
-                    await changed.wait()
-                return True
-        return False
+    def release(self, number: int) -> None:
+        """Lets the next one take the turn, if this command has it: it is on its way."""
+        if self._turn == number:
+            self._turn = None
+        if self._turn is None and self._waiting:
+            self._waiting[0][1].set()
+
+    def is_overtaken(self, number: int) -> bool:
+        """Whether a later command has ended, and may have been carried out."""
+        return number < self._last_ended
+
+    def end(self, number: int) -> None:
+        """Removes a command, wherever it is."""
+        if number in self._going:
+            del self._going[number]
+            self._last_ended = max(self._last_ended, number)
+        else:
+            del self._waiting[bisect_left(self._waiting, number, key=_NUMBER)]
+        self.release(number)

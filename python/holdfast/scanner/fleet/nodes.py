@@ -16,10 +16,12 @@ from nats.errors import TimeoutError as NoAnswer
 
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import nats_reason
+from holdfast.runtime import tasks
 from holdfast.scanner.errors import STOPPING, Moved, NotConfirmed, Refused
-from holdfast.scanner.fleet.command_order import WaitingCommands
+from holdfast.scanner.fleet.command_order import CommandOrder
 from holdfast.scanner.fleet.partition_leases import PARTITION
 from holdfast.scanner.fleet.questions import ask, subject
+from holdfast.scanner.late_commands import SEND_AGAIN
 from holdfast.scanner.messages.types import Answer
 from holdfast.scanner.reports.variables import fitting, joined
 
@@ -39,8 +41,7 @@ ANSWER_TIMEOUT_S = 2.0
 """Time to wait for the answer of another node."""
 
 RETRY_S = 0.1
-"""Between attempts to find the node that polls a device. In this time, a node that does not poll it
-answers; one that does may take longer."""
+"""Between attempts to find the node that polls a device."""
 
 ENVELOPE_BYTES = 512
 """Bytes of an answer without devices."""
@@ -91,11 +92,12 @@ class OtherNodes:
         self._member = member
         self._fleet = member.fleet
         self._move_timeout_s = 2 * self._fleet.settings.lease_times.ttl_s
-        """How long a command waits for a node that polls its device: twice a takeover."""
+        """How long a command waits for a node that polls its device, once it has found none: twice
+        a takeover."""
         self._numbers = count()
         """Of commands, in the order in which they were received."""
-        self._waiting: WeakValueDictionary[str, WaitingCommands] = WeakValueDictionary()
-        """By device. Each of its commands keeps them."""
+        self._orders: WeakValueDictionary[str, CommandOrder] = WeakValueDictionary()
+        """By device. Each of its commands keeps it."""
 
     async def write(
         self,
@@ -107,53 +109,60 @@ class OtherNodes:
     ) -> None:
         """Has a command carried out by the node that polls the device. Raises `Refused`.
 
-        See `Placement.write`. Of the commands to one device that wait, the one that was received
-        first goes first.
+        See `Placement.write`. The commands to a device are carried out in the order in which they
+        were received, or refused.
         """
-        end = time.monotonic() + self._move_timeout_s
-        why, was_tried = f"no node polls {device.id} now", False
-        waiting = self._waiting.setdefault(device.id, WaitingCommands())
+        why, gives_up_at = f"no node polls {device.id} now", 0.0
+        order = self._orders.setdefault(device.id, CommandOrder())
         number = next(self._numbers)
 
         def last_moment() -> float:
             seconds = remaining_s()
-            waiting.leave(number)
+            order.release(number)
             return seconds
+
+        def sent() -> None:
+            if not gives_up_at:  # Else it may come back again: the next one waits for its answer.
+                order.release(number)
 
         try:
             while True:
-                waiting.join(number)
-                if was_tried:
+                changed = order.wait(number)
+                if gives_up_at:
                     await asyncio.sleep(RETRY_S)
-                is_first = await waiting.turn(number, end - time.monotonic())
+                while not order.take(number):
+                    changed.clear()
+                    await tasks.within(remaining_s(), changed.wait())
                 # Each time: it may have waited, and the address of the device may change meanwhile.
                 left, device = remaining_s(), self._member.known(device)
-                if not is_first:
-                    raise Refused(f"not written: earlier commands to {device.id} wait")
+                if order.is_overtaken(number):
+                    passed = f"a later command to {device.id} went before it"
+                    raise Refused(f"not written: {passed}; {SEND_AGAIN}")
                 owner = self._fleet.holder(device.partition)
                 if self._member.is_own(device):
                     with contextlib.suppress(Moved):
                         await own(last_moment)
                         return
                 elif owner is not None and self._fleet.is_other(owner):
-                    # During a move, the next one waits: this one may be sent back.
-                    pause = RETRY_S if was_tried else 0
-                    leaving = asyncio.get_running_loop().call_later(pause, waiting.leave, number)
-                    try:
-                        sent = await self._forward(owner, device, tag, text, left)
-                    finally:
-                        leaving.cancel()
-                    if sent is None:
+                    flaw = await self._forward(owner, device, tag, text, left, sent)
+                    if flaw is None:
                         return
-                    why = sent
-                if time.monotonic() > end:
+                    why = flaw
+                now = time.monotonic()
+                gives_up_at = gives_up_at or now + self._move_timeout_s
+                if now > gives_up_at:
                     raise Refused(f"not written: {why}")
-                was_tried = True
         finally:
-            waiting.leave(number)
+            order.end(number)
 
     async def _forward(
-        self, owner: Holding, device: ScannedDevice, tag: str, text: str, left: float
+        self,
+        owner: Holding,
+        device: ScannedDevice,
+        tag: str,
+        text: str,
+        left: float,
+        sent: Callable[[], None],
     ) -> str | None:
         """Returns why another node did not carry out a command. Raises `Refused` if it tried."""
         holding = self._fleet.leases.seen.get(f"{PARTITION}{device.partition}")
@@ -167,7 +176,7 @@ class OtherNodes:
         # After this, it waits one timeout of the device for its turn, and one for the reply.
         timeout = self._move_timeout_s + 2 * device.source.timeout / 1000 + ANSWER_TIMEOUT_S
         try:
-            done = await self._ask(owner, "command", command, Executed, timeout)
+            done = await self._ask(owner, "command", command, Executed, timeout, sent)
         except NoRespondersError:  # The only error that is certain: nobody has the command.
             return f"node {owner.node} is gone"
         except (Error, OSError):
@@ -217,13 +226,19 @@ class OtherNodes:
         return reports
 
     async def _ask(
-        self, node: Holding, what: str, request: msgspec.Struct, kind: type[Reply], seconds: float
+        self,
+        node: Holding,
+        what: str,
+        request: msgspec.Struct,
+        kind: type[Reply],
+        seconds: float,
+        sent: Callable[[], None] = lambda: None,
     ) -> Reply:
         client = self._member.client
         if client is None:
             raise NoAnswer
         where = subject(self._prefix, node.node, what, node.process)
-        return await ask(client, where, msgspec.json.encode(request), kind, seconds)
+        return await ask(client, where, msgspec.json.encode(request), kind, seconds, sent)
 
 
 @dataclass(eq=False)

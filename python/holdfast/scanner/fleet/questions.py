@@ -17,6 +17,8 @@ from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.messages.types import Answer
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from nats.aio.client import Client
 
 Reply = TypeVar("Reply", bound=Answer)
@@ -34,9 +36,14 @@ class _Confirmation(msgspec.Struct):
 
 
 async def ask(
-    client: Client, where: str, question: bytes, kind: type[Reply], seconds: float
+    client: Client,
+    where: str,
+    question: bytes,
+    kind: type[Reply],
+    seconds: float,
+    sent: Callable[[], None] = lambda: None,
 ) -> Reply:
-    """Returns the answer of a node. Raises errors of nats-py.
+    """Returns the answer of a node. Raises errors of nats-py. `sent` is called before the answer.
 
     `Client.request` returns the first message that comes. If a stream of JetStream records the
     subject, that is the confirmation of the stream, also when there is no such node. So whatever
@@ -47,6 +54,7 @@ async def ask(
     try:
         async with asyncio.timeout(seconds):
             await client.publish(where, question, reply=inbox)
+            sent()
             while True:
                 message = await messages.next_msg(None)
                 if (message.headers or {}).get(Header.STATUS) == NO_RESPONDERS_STATUS:
