@@ -11,6 +11,7 @@ from holdfast.cli.signals import ended_by_ctrl_c, keep_hangups
 with ended_by_ctrl_c():
     import contextlib
     import importlib
+    import warnings
     from pathlib import Path
     from typing import TYPE_CHECKING, Any
 
@@ -171,6 +172,8 @@ class Program(SuggestingGroup):
     def main(self, *args: Any, **more: Any) -> Any:
         """Runs the program. Ends with 1 if standard output can't be written."""
         standard_output.prepare()
+        # Files of a system contain old authorities with a serial number that is not positive.
+        warnings.filterwarnings("ignore", "Parsed a serial number")
         try:
             return super().main(*args, **more)
         except OSError as error:

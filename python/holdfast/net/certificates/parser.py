@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from cryptography import x509
@@ -15,7 +14,6 @@ from cryptography.hazmat.primitives.serialization import (
     PrivateFormat,
     load_pem_private_key,
 )
-from cryptography.utils import CryptographyDeprecationWarning
 
 from holdfast.net.certificates.pem import (
     CERTIFICATE,
@@ -52,10 +50,6 @@ MALFORMED = (
     x509.UnsupportedGeneralNameType,
 )
 """What `cryptography` raises for malformed files, for some parts only when they are used."""
-
-
-# Files of a system contain old authorities with a serial number that is not positive.
-warnings.filterwarnings("ignore", "Parsed a serial number", CryptographyDeprecationWarning)
 
 
 def certificate(file: File, block: bytes) -> x509.Certificate:
