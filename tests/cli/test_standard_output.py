@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import io
+import logging
 import os
 import signal
 import subprocess
@@ -16,6 +17,7 @@ import pytest
 
 import holdfast
 from holdfast.cli import standard_output
+from holdfast.events.writer import QueuedHandler
 from holdfast.server import Identity
 from support import cli, wire
 from support.brokers import free_port
@@ -25,6 +27,16 @@ if TYPE_CHECKING:
 
 HOLDFAST = (sys.executable, "-m", "holdfast")
 FULL = Path("/dev/full")
+TELEGRAF = """
+[[inputs.modbus]]
+  name = "a"
+  controller = "tcp://a:502"
+  slave_id = 1
+  timeout = "1s"
+  holding_registers = [
+    {name = "b", byte_order = "AB", data_type = "UINT16", scale = 1.0, address = [0]},
+  ]
+"""
 
 with_full = pytest.mark.skipif(not FULL.exists(), reason="the system has no /dev/full")
 
@@ -42,16 +54,39 @@ def test_a_full_disk_is_one_line_of_error(words: Sequence[str]) -> None:
 
 @with_full
 def test_a_full_standard_error_changes_no_exit_code(tmp_path: Path) -> None:
-    config = tmp_path / "plant.yaml"
     device = "devices: {a: {url: tcp://a, interval: 1, tags: {x: {area: coils, address: %s}}, %s}}"
+    wrong, right = tmp_path / "wrong.yaml", tmp_path / "right.yaml"
+    wrong.write_text(device % (-1, ""))
+    right.write_text(device % (1, "tolerance: {pause: 2}"))  # Warns of the pause.
+    source = tmp_path / "telegraf.conf"
+    source.write_text(TELEGRAF)
     # Python prints the error again at its end, unless it does not buffer.
     env = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
-    for address, code in ((1, 0), (-1, 2)):
-        config.write_text(device % (address, "tolerance: {pause: 2}"))  # Warns of the pause.
+    for words, code in (
+        (("check", right), 0),
+        (("check", wrong), 2),
+        (("check", "--nope"), 2),
+        (("import", "telegraf", source), 0),
+    ):
         with FULL.open("wb") as full:
-            words = [*HOLDFAST, "check", str(config)]
-            ended = subprocess.run(words, stdout=subprocess.PIPE, stderr=full, env=env, check=False)
+            ended = subprocess.run(
+                [*HOLDFAST, *words], stdout=subprocess.PIPE, stderr=full, env=env, check=False
+            )
         assert ended.returncode == code
+
+
+@with_full
+def test_log_lines_that_a_full_standard_error_loses_are_counted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with FULL.open("w") as full:
+        for name in ("stdout", "stderr"):
+            monkeypatch.setattr(sys, name, full)
+        standard_output.prepare()
+        handler = QueuedHandler(sys.stderr)
+        handler.emit(logging.makeLogRecord({"msg": "lost"}))
+        handler.flush()
+        assert handler.dropped == 1
 
 
 @with_full
@@ -194,6 +229,7 @@ def test_files_and_pipes_of_windows_get_utf_8(
     monkeypatch.setattr(sys, "platform", platform)
     monkeypatch.setenv("PYTHONIOENCODING", demanded)
     monkeypatch.setattr(sys, "stdout", stream)
+    monkeypatch.setattr(sys, "stderr", stream)
     standard_output.prepare()
     assert (stream.encoding, stream.errors) == (encoding, "backslashreplace")
 

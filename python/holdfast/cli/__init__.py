@@ -181,8 +181,6 @@ class Program(SuggestingGroup):
                 raise
             standard_output.leave()
             fail(f"standard output: {standard_output.reason(error)}")
-        finally:
-            standard_output.end_errors()
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """The names of all commands."""

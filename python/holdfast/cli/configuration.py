@@ -6,10 +6,11 @@ import sys
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import click
+
 from holdfast.appliance.parts import certificate_expiry
 from holdfast.appliance.parts.native_listeners import server_tls
 from holdfast.appliance.services.services import https
-from holdfast.cli import standard_output
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.terminal_text import show_problems
 from holdfast.client.endpoint import check_files, endpoint, receiver_endpoint
@@ -122,5 +123,5 @@ def load_or_exit(path: Path | str, *, shows_warnings: bool = True) -> Config:
         is_answered = not isinstance(error, ConfigNotAnswered)
         sys.exit(ExitCode.WRONG if is_answered else ExitCode.FAILED)
     for warning in config.warnings if shows_warnings else ():
-        standard_output.print_error(f"warning: {warning}")
+        click.echo(f"warning: {warning}", err=True)
     return config

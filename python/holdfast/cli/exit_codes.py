@@ -6,7 +6,9 @@ import sys
 from enum import IntEnum
 from typing import NoReturn
 
-from holdfast.cli import answers, standard_output
+import click
+
+from holdfast.cli import answers
 
 
 class ExitCode(IntEnum):
@@ -39,5 +41,5 @@ def fail(
     if answers.wanted() and not is_printed:
         answers.print_wrong(reason, message, target)
     elif not is_printed:
-        standard_output.print_error(f"{prefix}{message}")
+        click.echo(f"{prefix}{message}", err=True)
     sys.exit(code)

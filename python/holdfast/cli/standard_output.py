@@ -1,5 +1,5 @@
 """Standard output that can't take what a command prints: another encoding, a full disk, a reader
-that is gone or does not read, a stream that is closed. Of standard error, what concerns exit codes.
+that is gone or does not read, a stream that is closed. Standard error drops what it can't take.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ import io
 import os
 import sys
 from pathlib import Path
-
-import click
+from typing import Any, cast
 
 _UNWRITABLE = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EPIPE)
 
@@ -21,6 +20,7 @@ def prepare() -> None:
 
     Files and pipes on Windows get UTF-8, which Holdfast requires of all that it reads, unless the
     user demands another encoding. Standard streams that are closed, as by `2>&-`, are replaced.
+    Standard error that can't be written changes no exit code.
     """
     # In the order of their descriptors: each is the lowest that is free. A socket that took the
     # place of one would get what native code prints.
@@ -33,6 +33,28 @@ def prepare() -> None:
         if isinstance(stream, io.TextIOWrapper):
             encoding = "utf-8" if is_local and not stream.isatty() else None
             stream.reconfigure(encoding=encoding, errors="backslashreplace")
+    sys.stderr = cast("Any", _Dropping(sys.stderr))
+
+
+class _Dropping:
+    """A stream that drops what can't be written. The log, which counts that, has its file."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Writes a text if that is possible."""
+        with contextlib.suppress(OSError):
+            self._stream.write(text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Writes what is buffered if that is possible."""
+        with contextlib.suppress(OSError):
+            self._stream.flush()
 
 
 def is_screen() -> bool:
@@ -60,22 +82,8 @@ def _number(error: OSError) -> int:
     return error.errno or 0
 
 
-def leave(stream: int = 1) -> None:
+def leave() -> None:
     """Drops what is not printed: Python would fail again at its end."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, stream)
+    os.dup2(nowhere, 1)
     os.close(nowhere)
-
-
-def print_error(line: object) -> None:
-    """Prints a line on standard error. If that can't be written, the exit code is the same."""
-    with contextlib.suppress(OSError):
-        click.echo(line, err=True)
-
-
-def end_errors() -> None:
-    """Drops what standard error can't take: the exit code of Python would be another one."""
-    try:
-        sys.stderr.flush()
-    except OSError:
-        leave(2)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from holdfast.cli import answers, standard_output
+from holdfast.cli import answers
 from holdfast.runtime.text import counted as counted
 from holdfast.runtime.text import extent
 from holdfast.values.digits import decimal_of
@@ -122,8 +122,8 @@ def show_problems(error: ConfigError) -> None:
         print_problems(error)
         return
     for problem in error.problems:
-        standard_output.print_error(problem)
-    standard_output.print_error(counted(len(error.problems), "problem"))
+        click.echo(problem, err=True)
+    click.echo(counted(len(error.problems), "problem"), err=True)
 
 
 def fits(text: str) -> bool:
