@@ -455,6 +455,17 @@ devices:
     assert [each.partition("interval: ")[2] for each in found] == ([message] if pauses else [])
 
 
+@pytest.mark.parametrize("pause", ["0.1, max_registers: 1", "0.6, max_gap: auto"])
+def test_pauses_that_may_be_short_enough_are_no_warning(folder: Folder, pause: str) -> None:
+    text = """
+devices:
+  meter: {url: tcp://a, tolerance: {pause: %s}, %s, interval: 0.3, tags: {
+    a: {area: coils, address: 1}, b: {area: discrete_inputs, address: 1},
+    c: {area: holding_registers, address: 1}}}
+"""
+    assert folder.warnings(text % tuple(pause.split(", "))) == []
+
+
 @pytest.mark.parametrize(
     ("stale", "told"),
     [

@@ -278,7 +278,7 @@ def _pauses(config: Config, name: str, device: DeviceConfig) -> tuple[float, int
     """The seconds of a poll in which the tolerance of the device allows no request, at least, and
     the number of requests of a poll."""
     tolerance = device.target.tolerance
-    if not tolerance.has_pauses and not tolerance.reconnect:
+    if (not tolerance.has_pauses and not tolerance.reconnect) or device.max_gap == "auto":
         return 0, 0
     reads = [(read.area, read.address, read.count) for read in device.reads]
     tags = [(tag.area, tag.span.start, len(tag.span)) for tag in config.tags(name)]
@@ -303,7 +303,7 @@ def _warnings(scope: Scope, path: KeyPath, device: DeviceConfig) -> Iterator[tup
         yield (*path, "writes"), f"{message} into holding registers"
     if device.is_polled and device.interval is not None:
         pauses, requests = _pauses(scope.config, str(path[-1]), device)
-        if pauses > device.interval:
+        if pauses > device.interval * (1 + 1e-9):  # 3 × 0.1 is more than 0.3.
             found = f"found {device.interval:g}, but the pauses of {counted(requests, 'request')}"
             yield (*path, "interval"), f"{found} take {pauses:g} s in each poll: polls are late"
     stored = any(read.into is not None for read in device.reads)
