@@ -521,8 +521,18 @@ def test_initial_values_from_yaml_are_checked(folder: Folder, values: str, probl
         ("a: 1\nb:\tc", "2: a tab before a value, allowed: spaces"),
         ("a: {unit: %}", "1: not YAML: text that begins with % needs quotes around the whole, "
          "as in unit: '%'"),
-        ("a:\n  b: 1\n\xa0 c: 2\n  d: 3", "3: not YAML: found the character U+00A0 "
+        ("a: @b", "1: not YAML: text that begins with @ needs quotes around the whole, "
+         "as in unit: '@'"),
+        ("a:\n  b: 1\n\xa0\u3000 c: 2\n  d: 3", "3: not YAML: found the character U+00A0 "
          "(no-break space), allowed: spaces"),
+        ("a: 1\n\xa0b\nc: 2", "2: not YAML: found the character U+00A0 (no-break space), "
+         "allowed: spaces"),
+        ("a:\n  b: |\n    \u3000c\n  d: 1\n  - e", "5: not YAML: indented unlike the entries "
+         "above it, allowed: those of a list begin in the same column"),
+        ("a: *b #\xa0c", "1: not YAML: found undefined alias 'b'"),
+        ('a: "b\n  \u3000c\\p"', "2: not YAML: found unknown escape character 'p', while scanning "
+         "a double-quoted scalar that starts in line 1; in double quotes, \\ begins an escape: "
+         "write a path in single quotes, or with /"),
         ("a:\n    b: 1\n  c: 2", "3: not YAML: indented unlike the keys above it, allowed: keys of "
          "one mapping begin in the same column"),
         (

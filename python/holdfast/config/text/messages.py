@@ -13,7 +13,7 @@ PATH_QUOTES = "write a path in single quotes, or with /"
 """What helps against `\\` in double quotes, where it begins an escape."""
 
 
-_FOREIGN_SPACE = re.compile(r"\s*([^\S\x00-\x7f])")
+_FOREIGN_SPACE = re.compile(r"\s*?([^\S\x00-\x7f])")
 
 
 def foreign_space(text: str) -> str | None:

@@ -71,12 +71,12 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
     if reason == _TAB and mark and mark.buffer[mark.pointer - mark.column : mark.pointer].strip():
         # It is YAML, but both parsers refuse it.
         return Problem(file, line, column, "", "a tab before a value, allowed: spaces")
-    if mark and (blank := _foreign_space(mark, start or mark)) is not None:
+    if mark and (blank := _foreign_space(error)) is not None:
         line, reason = blank
         column = None
     elif (character := _FORBIDDEN_START.fullmatch(reason)) is not None:
         begin = f"text that begins with {character[1]} needs quotes around the whole"
-        reason = f"{begin}, as in unit: '%'"
+        reason = f"{begin}, as in unit: '{character[1]}'"
     elif reason in PLAIN_REASONS:
         reason = PLAIN_REASONS[reason]
     elif error.context and start and mark and start.line != mark.line:
@@ -88,11 +88,19 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
     return Problem(file, line, column, "", f"not YAML: {reason}")
 
 
-def _foreign_space(mark: Any, start: Any) -> tuple[int, str] | None:
+def _foreign_space(error: MarkedYAMLError) -> tuple[int, str] | None:
     """The line and the reason of an error that comes from a space that is none in YAML."""
-    first = max(min(start.line, mark.line - 1), 0)
-    for number, line in enumerate(mark.buffer.splitlines()[first : mark.line + 1], first + 1):
-        for part in (line, line.partition(":")[2]):
+    context, mark = error.context or "", error.problem_mark
+    if "quoted" in context:
+        return None
+    first = last = mark.line
+    if context == "while scanning a simple key":
+        first = last = error.context_mark.line
+    elif error.problem == "mapping values are not allowed here":
+        first -= 1  # Where a text of several lines may begin, but none in quotes.
+    for number, line in list(enumerate(mark.buffer.splitlines(), 1))[max(first, 0) : last + 1]:
+        code = line.partition("#")[0]
+        for part in (code, code.partition(":")[2]):
             if (blank := foreign_space(part)) is not None:
                 return number, f"found {blank}, allowed: spaces"
     return None
