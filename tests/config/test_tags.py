@@ -322,6 +322,11 @@ def test_each_wrong_key_of_a_tag_is_reported(tmp_path: Path, settings: str, keys
     assert found >= {f"mqtt.map[0].tag.{key}" for key in keys.split()}
 
 
+def test_a_table_without_a_valid_row_is_not_judged_as_yaml(tmp_path: Path) -> None:
+    (problem,) = problems(written(tmp_path, ",hr,1\n", "t.csv"))
+    assert "t.csv:1: the tag has no name" in problem
+
+
 def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
     tags = (
         "a: {area: input_registers, address: 1, null: [-5]}, "

@@ -160,8 +160,9 @@ def _csv(text: str, file: str) -> tuple[yaml_document.Document, list[Problem]]:
         rule = "a cell that begins with a quote ends with one, and has others twice"
         table.refuse(first, f"not CSV: {error}, allowed: {rule}")
         raise ConfigError(file, table.problems) from None
-    if not table.tags and not table.problems:
-        table.refuse(1, "found no tags, allowed: one in each line, as in level,hr,0")
+    if not table.tags:
+        if not table.problems:
+            table.refuse(1, "found no tags, allowed: one in each line, as in level,hr,0")
         raise ConfigError(file, table.problems)
     document = yaml_document.table(file, {"tags": table.tags}, table.lines)
     return document, table.problems
