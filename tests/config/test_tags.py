@@ -374,12 +374,22 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
         (
             "t.yaml",
             "tags: {a: {area: holding_registers, address: 1, min: 0,05}}\n",
-            "t.yaml:1: tags.a.5: found a decimal comma before it, allowed: a decimal point",
+            "t.yaml:1: tags.a.min: found a decimal comma behind 0, allowed: a decimal point",
+        ),
+        (
+            "t.yaml",
+            "tags: {a: {area: holding_registers, address: 1, min: 10, 5: }}\n",
+            "t.yaml:1: tags.a.5: unknown key",
         ),
         (
             "t.yaml",
             "tags:\n  a:\n    area: coils\n    address: 1\n    scale: 0,1\n",
             "t.yaml:5: tags.a.scale: '0,1' has a decimal comma, allowed: a decimal point",
+        ),
+        (
+            "p.yaml",
+            DEVICE.replace("interval: 1", "interval: '1,000'"),
+            "p.yaml:1: devices.a.interval: found '1,000', allowed: a number from 0.01",
         ),
         (
             "p.yaml",

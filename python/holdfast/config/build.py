@@ -6,6 +6,7 @@ Each error becomes one message: what was found, and what is allowed.
 from __future__ import annotations
 
 import re
+from itertools import islice, pairwise
 from math import inf
 from typing import TYPE_CHECKING, Any
 
@@ -75,7 +76,7 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
     elif kind == "missing":
         report.add_key(path, f"missing, allowed: {allowed(path, data)}")
     elif kind in ("extra_forbidden", "invalid_key"):
-        report.add_key(path, _unknown(path, report))
+        _add_unknown(path, report)
     elif kind == "problem_at":
         context = error["ctx"]
         where = (*path, context["key"]) if context["key"] else path
@@ -89,7 +90,10 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
         words = "an integer" if of_key and kind == "int_type" else f"{allowed(path, data)}{near}"
         words += _in_seconds(error["input"], words)
         found = _shown(path, error["input"])
-        comma = decimal_comma(str(error["input"])) if words.startswith("a number") else None
+        text = str(error["input"])
+        # The comma in 1,000 may be that of thousands.
+        may_cut = words.startswith("a number") and re.search(",[0-9]{3}$", text) is None
+        comma = decimal_comma(text) if may_cut else None
         message = f"found {found}, allowed: {words}" if comma is None else f"{found} {comma}"
         report.add(path, message)
 
@@ -135,24 +139,30 @@ def _shown(path: KeyPath, value: object) -> str:
     return shape(value) if of_token or path[-1:] in _URLS else show(value)
 
 
-def _unknown(path: KeyPath, report: Report) -> str:
+def _add_unknown(path: KeyPath, report: Report) -> None:
     key = path[-1]
-    if (blank := foreign_space(str(key))) is not None:
-        return f"found {blank} before the key, allowed: spaces"
-    if isinstance(key, int) and _follows_number(path, report):
-        return "found a decimal comma before it, allowed: a decimal point, as in 0.1"
     known = known_keys(path[:-1], report.document.data)
-    return f"unknown key, allowed: {listing(known)}{suggestion(key, known)}"
+    if (blank := foreign_space(str(key))) is not None:
+        report.add_key(path, f"found {blank} before the key, allowed: spaces")
+    elif isinstance(key, int) and (cut := _cut_number(path, report, len(known))) is not None:
+        found = f"found a decimal comma behind {report.raw(cut)}"
+        report.add_final(cut, f"{found}, allowed: a decimal point, as in 0.1")
+    else:
+        words = f"allowed: {listing(known)}{suggestion(key, known)}"
+        report.add_key(path, f"unknown key, {words}")
 
 
-def _follows_number(path: KeyPath, report: Report) -> bool:
-    """Whether a key is what follows a decimal comma in brackets: `{scale: 0,1}`."""
-    owner = report.raw(path[:-1]) if report.document.holds(path) else {}
-    keys = list(owner)
-    before = keys[keys.index(path[-1]) - 1] if path[-1] in keys[1:] else None
-    return (
-        before is not None
-        and owner[path[-1]] is None
-        and type(owner[before]) is int
-        and report.line(path) == report.line((*path[:-1], before))
-    )
+def _cut_number(path: KeyPath, report: Report, known: int) -> KeyPath | None:
+    """The number behind whose comma in brackets this key stands: `{scale: 0,1}`."""
+    document, owner = report.document, path[:-1]
+    if not document.holds(path) or report.raw(path) is not None:
+        return None
+    # A mapping of known keys, each of which has a comma, has twice as many.
+    for before, key in pairwise(islice(report.raw(owner), 2 * known)):
+        if key == path[-1] and type(number := report.raw((*owner, before))) is int:
+            start, end = document.place((*owner, before)), document.place(path, of_key=True)
+            length = end.column - start.column - len(",") if end.line == start.line else 0
+            # Between two entries of a mapping, there is a space. A 0 may be written as -0.
+            is_cut = length == len(str(number)) or (number, length) == (0, len("-0"))
+            return (*owner, before) if is_cut else None
+    return None

@@ -105,8 +105,6 @@ def check_unit(scope: Scope, path: KeyPath, unit: Unit, rule: Rule) -> None:
 def _check_functions(scope: Scope, path: KeyPath, unit: Unit, rule: Rule) -> None:
     """Reports functions that the rule does not allow."""
     for where, code in items(path, unit.functions or ()):
-        if scope.report.has_final(where):
-            continue
         if code in (rule.deny or ()):
             message = f"found {code}, which the rule denies"
             scope.report.add(where, f"{message}, allowed: functions that the rule allows")

@@ -30,7 +30,9 @@ class Report:
         return list(self.found)
 
     def add(self, path: KeyPath, message: str, *, of_key: bool = False) -> None:
-        """Adds a problem with the value at `path`, or with the key itself."""
+        """Adds a problem with the value at `path`, or with the key itself, unless it is final."""
+        if path in self.final:
+            return
         problem = self._at(path, message, of_key)
         if not (self._of_many(path) and any(_alike(problem, other) for other in self.found)):
             self.found.setdefault(problem, path)
@@ -44,12 +46,9 @@ class Report:
         for problem, where in list(self.found.items()):
             if where[: len(path)] == path:
                 del self.found[problem]
+        self.final.discard(path)
         self.add(path, message, of_key=of_key)
         self.final.add(path)
-
-    def has_final(self, path: KeyPath) -> bool:
-        """Whether `add_final` reported the only problem of `path`."""
-        return path in self.final
 
     def warn(self, path: KeyPath, message: str) -> None:
         """Adds a warning: a valid setting at `path` that has no effect, or probably a wrong one."""
