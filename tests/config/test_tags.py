@@ -312,6 +312,19 @@ def test_problems_in_profile_files_name_file_line_and_tag(tmp_path: Path) -> Non
         ("area: coils, address: 0, type: int16, scale: 0.1, max: 3", "type"),
         ("area: holding_registers, address: 0, type: f32, states: {-1: a}, null: [nan]", "type"),
         ("area: hr, address: 900, scale: {from: {area: coils, address: 0}, as: factor}", "area"),
+        ("area: holding_registers, address: 65534, type: double, order: GHEFCDAB", "type"),
+        ("area: coil, address: 0, order: GHEFCDAB", "area"),
+        (
+            "area: holding_registers, address: 0, type: float64, order: GHEFCDAB, "
+            "scale: {from: {area: holding_registers, address: 9}, as: factor}",
+            "scale",
+        ),
+        (
+            "area: holding_registers, address: 0, order: LE, "
+            "scale: {from: {area: holding_registers, address: 9}, as: factor}",
+            "order",
+        ),
+        ("area: holding_registers, address: 0, scale: 0,1", "scale"),
     ],
 )
 def test_each_wrong_key_of_a_tag_is_reported(tmp_path: Path, settings: str, keys: str) -> None:

@@ -253,13 +253,14 @@ class Tag(WritableTag):
 _NUMBERS = ("scale", "offset", "min", "max", "deadband")
 
 JUDGED_WITH = {
+    "address": {"type"},
     "encoding": {"type"},
     "states": {"type", "scale", "offset"},
     "null": {"area", "type", "encoding"},
     "writable": {"area"},
 }
-"""The keys without which an error of another key may be none: those that a single number in holding
-registers, without a scale, may have in any case are not here."""
+"""The keys without which an error of another key may be none: those that a single integer in
+holding registers, without a scale, may have in any case are not here."""
 
 _KEYS = {UnknownOrder: "order", UnknownEncoding: "encoding"}
 """The keys that errors of conversions are about; all others are about the type."""

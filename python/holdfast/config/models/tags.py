@@ -112,10 +112,10 @@ class TagConfig(Model):
                 _made(name, settings)
                 return
             except TagError as error:
-                value = settings.pop(error.key)
+                value = settings.pop(error.key, None)
                 is_register = isinstance(value, ScaleConfig)
-                needed = _PLACE if is_register else JUDGED_WITH.get(error.key, _NOTHING)
-                if wrong.isdisjoint(needed):
+                needed = _PLACE if is_register else JUDGED_WITH.get(error.key, ())
+                if wrong.isdisjoint((error.key, *needed)):
                     yield error
                 wrong.add(error.key)
                 if error.key == "type" and settings.get("area") in BIT_AREAS:
@@ -124,7 +124,9 @@ class TagConfig(Model):
 
     def _valid_settings(self, order: str) -> dict[str, Any]:
         settings = dict(self.__dict__)  # Invalid keys are not there.
-        if "type" in settings:
+        if self.__dict__.get("type") is None and "area" not in settings:
+            settings.pop("type", None)  # The area decides which type is the default.
+        elif "type" in settings:
             settings["type"] = (self.type or "").lower()
         if "order" in settings:
             settings["order"] = (self.order or order).upper()
@@ -141,16 +143,22 @@ class TagConfig(Model):
 
 def _made(name: str, settings: Mapping[str, Any]) -> Tag:
     """The tag with these settings. Raises `TagError`."""
+    settings = {**_STAND_INS, **settings}
     scale = settings.get("scale")
     if isinstance(scale, ScaleConfig):
-        settings = {**settings, "scale": scale.of(settings.get("order", DEFAULT_ORDER))}
-    return Tag(name, **{**_ANYWHERE, **settings})
+        try:
+            settings["scale"] = scale.of(settings.get("order", DEFAULT_ORDER))
+        except TagError as error:
+            # An order that is no order of the tag is the error, not the scale.
+            Tag(name, **{**settings, "scale": 1, "states": {}})
+            raise TagError("scale", f"from: {error}") from None
+    return Tag(name, **settings)
 
 
-_ANYWHERE: dict[str, Any] = {"area": "holding_registers", "address": 0}
-"""In place of an invalid area or address, so that other keys are judged all the same."""
-_PLACE = frozenset(_ANYWHERE)
-_NOTHING = frozenset[str]()
+_STAND_INS: dict[str, Any] = {"area": "holding_registers", "address": 0, "type": "uint64"}
+"""In place of an invalid area, address or type, so that other keys are judged all the same. Eight
+bytes can have every order."""
+_PLACE = frozenset(("area", "address"))
 
 
 class ProfileConfig(Model):

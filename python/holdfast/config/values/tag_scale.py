@@ -11,7 +11,7 @@ from holdfast.config.values.scalars import exact_number, is_name, whole
 from holdfast.protocol import LAST_ADDRESS
 from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import either, listing
-from holdfast.tags import Tag, TagError
+from holdfast.tags import Tag
 from holdfast.tags.scale import Form, RegisterScale
 from holdfast.tags.text import decimal_comma
 from holdfast.types import AREAS, Area
@@ -58,13 +58,7 @@ class ScaleConfig:
         if isinstance(self.source, str):
             return RegisterScale(self.form, name=self.source)
         area, address, kind = self.source
-        try:
-            return RegisterScale(self.form, source=Tag("", area, address, kind.lower(), order))
-        except TagError as error:
-            # The order is that of the tag.
-            if error.key == "order":
-                raise
-            raise TagError("scale", f"from: {error}") from None
+        return RegisterScale(self.form, source=Tag("", area, address, kind.lower(), order))
 
 
 def parse_scale(value: object) -> float | ScaleConfig:
