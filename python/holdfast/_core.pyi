@@ -1479,7 +1479,7 @@ class Link:
         ends when the devices had time to carry it out. Returns `None` when the queue is full.
 
         With `peers`, addresses, the request is sent only on a connection to one of them. If there
-        is another connection, or the device's name has none of them, the call ends with the result
+        is another connection, or the device's name has others, too, the call ends with the result
         `PermissionError`.
         """
 

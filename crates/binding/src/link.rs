@@ -113,9 +113,15 @@ impl Link {
         peers: Option<Vec<String>>,
     ) -> PyResult<Option<u64>> {
         let (unit_id, timeout) = (byte("unit", unit)?, seconds("timeout", timeout)?);
-        let peers = peers.map_or_else(Peers::default, |all| {
-            Peers::only(all.iter().filter_map(|each| each.parse::<IpAddr>().ok()))
-        });
+        let address = |text: &String| {
+            let error =
+                |_| PyValueError::new_err(format!("peers: found {text}, allowed: addresses"));
+            text.parse::<IpAddr>().map_err(error)
+        };
+        let peers = match peers {
+            Some(all) => Peers::only(all.iter().map(address).collect::<PyResult<Vec<_>>>()?),
+            None => Peers::default(),
+        };
         Ok(self.core.call(&caller.core, unit_id, &request.encoded, timeout, broadcast, peers))
     }
 

@@ -176,7 +176,7 @@ class _LinkTurns(Turns):
             self.is_sent |= self._calls.give_up(ticket, answer)
             raise
         if isinstance(result, PermissionError):
-            if not self.is_sent:
+            if not (self.is_sent or sent):
                 raise Elsewhere
             result = ConnectionLost(MOVED)
         if isinstance(result, ConnectionLost | RequestTimeout):

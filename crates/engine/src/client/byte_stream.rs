@@ -280,7 +280,7 @@ impl ByteStream for OpenLine<serial2::SerialPort> {
     }
 }
 
-/// The addresses of a name that are among the `peers`.
+/// The addresses of a name, if all are among the `peers`.
 fn addresses(
     host: &str,
     port: u16,
@@ -288,7 +288,7 @@ fn addresses(
     deadline: Instant,
 ) -> Result<Vec<SocketAddr>, StreamError> {
     let found = name_lookup::addresses(host, port, deadline)?;
-    peers.among(found).ok_or(StreamError::Elsewhere)
+    if peers.hold_all(&found) { Ok(found) } else { Err(StreamError::Elsewhere) }
 }
 
 /// Tries the addresses of a name in order, until `open` succeeds. It also gets the number of addresses that

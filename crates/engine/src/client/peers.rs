@@ -10,7 +10,10 @@ pub struct Peers(Option<Arc<[IpAddr]>>);
 impl Peers {
     /// Only these.
     pub fn only(addresses: impl IntoIterator<Item = IpAddr>) -> Peers {
-        Peers(Some(addresses.into_iter().map(|each| each.to_canonical()).collect()))
+        let mut all: Vec<_> = addresses.into_iter().map(|each| each.to_canonical()).collect();
+        // Equal reads have equal ones, in whatever order a name server gives them.
+        all.sort_unstable();
+        Peers(Some(all.into()))
     }
 
     /// Whether a request may be sent on a connection to `peer`; `None` if that is not known.
@@ -19,13 +22,10 @@ impl Peers {
         peer.is_some_and(|peer| all.contains(&peer.to_canonical()))
     }
 
-    /// Those of the addresses of a name that may be connected to; `None` if all are others.
-    pub(crate) fn among(&self, mut found: Vec<SocketAddr>) -> Option<Vec<SocketAddr>> {
-        if self.0.is_none() {
-            return Some(found);
-        }
-        found.retain(|each| self.hold(Some(each.ip())));
-        (!found.is_empty()).then_some(found)
+    /// Whether a connection that others use, too, may be opened to any of the addresses of a name. For fewer of them
+    /// it would lead those others to another device.
+    pub(crate) fn hold_all(&self, found: &[SocketAddr]) -> bool {
+        found.iter().all(|each| self.hold(Some(each.ip())))
     }
 }
 
@@ -36,12 +36,10 @@ mod tests {
     #[test]
     fn a_request_goes_only_to_its_peers_in_either_form() {
         let found = |all: &[&str]| all.iter().map(|each| each.parse().unwrap()).collect::<Vec<_>>();
-        let (both, other) = (found(&["[::1]:502", "127.0.0.1:502"]), found(&["[::1]:502"]));
-        assert_eq!(Peers::default().among(both.clone()), Some(both.clone()));
-        assert!(Peers::default().hold(None));
+        let (both, one) = (found(&["[::1]:502", "127.0.0.1:502"]), found(&["127.0.0.1:502"]));
+        assert!(Peers::default().hold_all(&both) && Peers::default().hold(None));
         let peers = Peers::only(["::ffff:127.0.0.1".parse().unwrap()]);
-        assert_eq!(peers.among(both), Some(found(&["127.0.0.1:502"])));
-        assert_eq!(peers.among(other), None);
+        assert!(peers.hold_all(&one) && !peers.hold_all(&both));
         assert!(!peers.hold(None), "who it is, is not known");
     }
 }

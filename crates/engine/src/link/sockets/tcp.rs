@@ -214,8 +214,10 @@ impl TcpLink {
         permit.check(false)?;
         let found =
             match timeout_at(deadline, name_lookup::addresses_of(&self.host, self.port)).await {
-                Ok(Ok(found)) => Ok(permit.peers.among(found).ok_or(ClientError::Elsewhere)?),
-                Ok(Err(error)) => Err(error),
+                Ok(Ok(all)) if !permit.peers.hold_all(&all) => {
+                    return Err(ClientError::Elsewhere.into());
+                }
+                Ok(found) => found,
                 Err(_) => {
                     let error = ClientError::LookupTimeout { to: self.url.clone(), after: timeout };
                     return Err(self.pause.failed(error));
