@@ -96,7 +96,7 @@ class Audit:
             stored = self._store(records)
             if stored == len(records):
                 return
-            if self.fail_closed:
+            if self.fail_closed and not self._is_closed:
                 self._waiting += records[stored:]
             else:
                 self._lose(records[stored:])
