@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 from holdfast.cli import terminal_text
 from holdfast.cli.devices import coverage
+from holdfast.cli.devices.search_report import ignored_text, ignored_to_json
 from holdfast.cli.terminal_text import number_ranges
 from holdfast.config.tag_files.write import scale_as_data
 from holdfast.discovery.description import undescribed
-from holdfast.discovery.device_search import UNUSUAL_UNIT, devices
+from holdfast.discovery.device_search import devices
 from holdfast.discovery.segments import FILL_REASONS
 from holdfast.tags.scale import RegisterScale
 from holdfast.values.json import jsonable
@@ -44,20 +45,6 @@ def units_lines(
     if alike:
         is_one = any(each in alike for each in devices(seen, alike))
         yield f"{ignored_text(seen, alike)} {'One is' if is_one else 'None of them is'} described."
-
-
-def ignored_text(seen: Sequence[Unit], alike: Sequence[Unit]) -> str:
-    """What the unit ids are that answer as a rare one does."""
-    if len(alike) == len(seen):
-        return "The device answers every unit id: it probably ignores them."
-    units = number_ranges(each.unit for each in alike)
-    return f"Unit ids {units} answer as {UNUSUAL_UNIT} does: probably no devices of their own."
-
-
-def ignored_to_json(seen: Sequence[Unit], alike: Sequence[Unit]) -> dict[str, object]:
-    """The same for JSON."""
-    ignores = bool(seen) and len(alike) == len(seen)
-    return {"ignores_unit": ignores, "alike": [each.unit for each in alike]}
 
 
 def _without_answer(seen: Sequence[Unit]) -> tuple[list[int], list[int]]:

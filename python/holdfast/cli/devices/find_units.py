@@ -9,8 +9,13 @@ import click
 
 from holdfast.cli import terminal_text
 from holdfast.cli.device_errors import hint_at_silence
-from holdfast.cli.devices.describe_output import ignored_text, ignored_to_json
-from holdfast.cli.devices.search_report import NOTHING, Report, ended_to_json
+from holdfast.cli.devices.search_report import (
+    NOTHING,
+    Report,
+    ended_to_json,
+    ignored_text,
+    ignored_to_json,
+)
 from holdfast.cli.exit_codes import ExitCode
 from holdfast.cli.options import device
 from holdfast.cli.options.units import refuse_broadcast

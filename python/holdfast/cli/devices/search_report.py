@@ -12,15 +12,18 @@ import click
 from holdfast.cli import answers, device_errors, terminal_text
 from holdfast.cli.progress import bar
 from holdfast.cli.signals import Interrupted
+from holdfast.cli.terminal_text import number_ranges
 from holdfast.discovery.address_search import LimitReached
+from holdfast.discovery.device_search import UNUSUAL_UNIT
 from holdfast.errors import ConnectFailed, ModbusError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from holdfast.cli.progress import Bar
     from holdfast.cli.signals import Signals
     from holdfast.discovery.address_search import Finding, Survey
+    from holdfast.discovery.device_search import Unit
 
 
 @dataclass(frozen=True)
@@ -173,3 +176,17 @@ class RangeReport:
             self._printed.append(finding)
             self._report.text(*rows)
             self._report.entry({**self._about, **place})
+
+
+def ignored_text(seen: Sequence[Unit], alike: Sequence[Unit]) -> str:
+    """What the unit ids are that answer as a rare one does."""
+    if len(alike) == len(seen):
+        return "The device answers every unit id: it probably ignores them."
+    units = number_ranges(each.unit for each in alike)
+    return f"Unit ids {units} answer as {UNUSUAL_UNIT} does: probably no devices of their own."
+
+
+def ignored_to_json(seen: Sequence[Unit], alike: Sequence[Unit]) -> dict[str, object]:
+    """The same for JSON."""
+    ignores = bool(seen) and len(alike) == len(seen)
+    return {"ignores_unit": ignores, "alike": [each.unit for each in alike]}
