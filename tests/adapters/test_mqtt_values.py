@@ -139,7 +139,12 @@ REFUSED: list[tuple[dict[str, Any], str, str, float | None]] = [
         0.1,
     ),
     ({"scale": 0.1}, "6553.6", "65536 is outside 0 to 65535 of uint16", 0.1),
-    ({"scale": 0.5, "max": 20.3}, "20.3", "20.3 is 20.5 in steps of 0.5, outside to 20.3", 0.5),
+    (
+        {"scale": 0.5, "max": 20.3},
+        "20.3",
+        "20.3 is 20.5 in steps of 0.5, outside the limits, allowed: up to 20.3",
+        0.5,
+    ),
     ({"scale": 0.1}, "warm", "'warm' is not a number", 0.1),
     (
         {"states": {0: "off", 1: "on"}},
