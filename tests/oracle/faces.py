@@ -404,7 +404,8 @@ class RestFace(Face):
 def _rejected(request: Request, reply: Mapping[str, Any]) -> Reply:
     """A refusal of REST or MQTT."""
     if is_passed([write.block for write in request.writes]):
-        if reply.get("reason") == "mirrored":
+        # Withdrawn: REST has started again while the write waited.
+        if reply.get("reason") in ("mirrored", "withdrawn"):
             return Reply(Outcome.REFUSED)
         if reply.get("reason") == "device_refused":
             # It does not say whether the device has answered.
