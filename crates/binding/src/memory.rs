@@ -12,7 +12,7 @@ use pyo3::exceptions::{PyIndexError, PyOSError, PyOverflowError, PyTypeError, Py
 use pyo3::prelude::*;
 use pyo3::types::{
     PyBool, PyByteArray, PyBytes, PyDict, PyFrozenSet, PyInt, PyList, PyMapping, PyMemoryView,
-    PyRange, PySet, PyString, PyTuple,
+    PySequence, PySet, PyString,
 };
 
 use crate::arguments::{within, word};
@@ -463,13 +463,13 @@ pub fn numbers<'py>(name: &str, area: Area, values: &Bound<'py, PyAny>) -> PyRes
 /// Text and bytes yield characters, a mapping its keys, a set no order, and what has rows and columns,
 /// such as a `DataFrame` of pandas, the names of its columns.
 pub fn is_sequence(values: &Bound<'_, PyAny>) -> bool {
-    // The usual ones, at once: what follows takes longer than a write of one register.
-    if values.is_exact_instance_of::<PyTuple>() || values.is_exact_instance_of::<PyRange>() {
-        return true;
-    }
     let is_text = values.is_instance_of::<PyString>()
         || values.is_instance_of::<PyBytes>()
         || values.is_instance_of::<PyByteArray>();
+    // The usual ones, at once: what follows takes longer than a write of one register.
+    if !is_text && values.cast::<PySequence>().is_ok() {
+        return true;
+    }
     let is_unordered = values.is_instance_of::<PySet>()
         || values.is_instance_of::<PyFrozenSet>()
         || values.cast::<PyMapping>().is_ok();
