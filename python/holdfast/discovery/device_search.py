@@ -295,8 +295,9 @@ def like_unusual(
 
 
 def devices(asked: Sequence[Unit], alike: Sequence[Unit]) -> list[Unit]:
-    """The unit ids that are devices of their own, and one of those that answer `alike`, as
-    `like_unusual` returned them; not if others have values, and those have only an exception.
+    """The unit ids to describe: all that answer in a way of their own, and the first of those that
+    answer `alike`, as `like_unusual` returned them. That one is left out if it has only an
+    exception and others have values.
     """
     own = [unit for unit in asked if unit.answers and unit not in alike]
     is_device = not own or any(unit.detail == ANSWERS or unit.identity.objects for unit in alike)

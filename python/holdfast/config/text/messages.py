@@ -17,7 +17,7 @@ _FOREIGN_SPACE = re.compile(r"\s*?([^\S\x00-\x7f])")
 
 
 def foreign_space(text: str) -> str | None:
-    """The first space that is none in YAML, of those before a text; `None` without one."""
+    """The first space before a text that YAML does not take for one; `None` if there is none."""
     found = _FOREIGN_SPACE.match(text)
     if found is None:
         return None

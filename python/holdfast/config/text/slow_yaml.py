@@ -89,7 +89,7 @@ def _syntax(error: MarkedYAMLError, file: str) -> Problem:
 
 
 def _foreign_space(error: MarkedYAMLError) -> tuple[int, str] | None:
-    """The line and the reason of an error that comes from a space that is none in YAML."""
+    """The line and the reason of an error that is due to a space which YAML does not know."""
     context, mark = error.context or "", error.problem_mark
     if "quoted" in context:
         return None
