@@ -22,7 +22,7 @@ from holdfast.scanner import responder
 from holdfast.scanner.commands import Commands
 from holdfast.scanner.dialects import TENTACLE
 from holdfast.scanner.errors import Moved
-from holdfast.scanner.jetstream.heartbeat import HeartbeatKey
+from holdfast.scanner.jetstream.heartbeat_key import HeartbeatKey
 from holdfast.scanner.messages.decoding import Adjustments
 from holdfast.scanner.messages.types import (
     Answer,

@@ -14,7 +14,7 @@ import holdfast
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import Ping
 from holdfast.scanner import presence
-from holdfast.scanner.jetstream import heartbeat
+from holdfast.scanner.jetstream import heartbeat_key
 from support import wire
 from support.brokers import NatsServer
 from support.fake_device import FakeDevice, exception, registers
@@ -152,7 +152,7 @@ def test_another_service_is_noticed_by_its_heartbeat(
     started = beat(caller)["startedAt"]
 
     async def beat_too() -> None:
-        bucket = await caller.client.jetstream().key_value(heartbeat.BUCKET)
+        bucket = await caller.client.jetstream().key_value(heartbeat_key.BUCKET)
         other = {"serviceType": "modbus", "moduleId": "modbus", "lastSeen": 5, "startedAt": 7}
         await bucket.put("modbus", json.dumps({**other, "metadata": {}}).encode())
 

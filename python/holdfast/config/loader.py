@@ -13,7 +13,6 @@ from holdfast.config.allowed_words import allowed, known_keys
 from holdfast.config.build import build
 from holdfast.config.checks.bind_addresses import check_binds
 from holdfast.config.checks.common import Scope
-from holdfast.config.checks.connections import AddressChecks
 from holdfast.config.checks.devices import check_devices, warn_of_devices
 from holdfast.config.checks.extras import check_extras
 from holdfast.config.checks.former_keys import take_out_former_keys
@@ -26,6 +25,7 @@ from holdfast.config.checks.memories import check_memories, warn_of_grants
 from holdfast.config.checks.nats import check_logs, warn_of_logs
 from holdfast.config.checks.outputs import check_outputs, warn_of_outputs
 from holdfast.config.checks.services import check_services
+from holdfast.config.checks.shared_addresses import AddressChecks
 from holdfast.config.checks.tags import check_tags
 from holdfast.config.checks.units import warn_of_routes
 from holdfast.config.checks.written_files import check_written_files

@@ -15,7 +15,8 @@ from holdfast.events import log_lines
 from holdfast.events.rotation import Rotation
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.sending import Receiver
-from holdfast.tags.text import csv_lines, plain, text_of
+from holdfast.tags.csv_text import csv_lines
+from holdfast.tags.text import plain, text_of
 
 if TYPE_CHECKING:
     import io

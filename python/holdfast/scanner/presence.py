@@ -20,7 +20,7 @@ from holdfast.events import log_lines
 from holdfast.net.nats import batch
 from holdfast.runtime import tasks
 from holdfast.runtime.malformed_json import MALFORMED_JSON
-from holdfast.scanner.jetstream.heartbeat import HEARTBEAT_INTERVAL_S, HeartbeatKey
+from holdfast.scanner.jetstream.heartbeat_key import HEARTBEAT_INTERVAL_S, HeartbeatKey
 from holdfast.scanner.messages.types import Announcement, HeartbeatMetadata, OtherScanner
 
 if TYPE_CHECKING:

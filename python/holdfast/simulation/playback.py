@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from holdfast.config.text import yaml_document
 from holdfast.config.text.problems import ConfigError
 from holdfast.simulation.capacity import Capacity
+from holdfast.tags.csv_text import csv_separator
 from holdfast.tags.strict_text import from_text
-from holdfast.tags.text import csv_separator, value_from
+from holdfast.tags.text import value_from
 from holdfast.values import DoesNotFit
 
 if TYPE_CHECKING:

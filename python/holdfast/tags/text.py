@@ -1,4 +1,4 @@
-"""Values of tags as text, in CSV and for JSON, and text as values to write.
+"""Values of tags as text and for JSON, and text as values to write.
 
 What `text_of` returns, `value_from` accepts, except for infinity, and scaled 64-bit integers with
 more digits than a float has.
@@ -7,7 +7,6 @@ more digits than a float has.
 from __future__ import annotations
 
 import base64
-import csv
 import math
 import re
 from fractions import Fraction
@@ -23,7 +22,7 @@ from holdfast.values import DoesNotFit
 from holdfast.values.digits import shortest
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection
 
     from holdfast.tags.tag import Tag
 
@@ -72,25 +71,6 @@ def text_of(tag: Tag, value: Any, *, states: bool = True) -> str:
         places = None if tag.is_float else _places(tag.scale, tag.offset)
         return shortest(_trimmed(tag, value), "") if places is None else f"{value:.{places}f}"
     return str(value)
-
-
-def csv_lines(rows: Iterable[Iterable[object]]) -> str:
-    """Rows of cells as lines of CSV, each of which ends with a newline."""
-    lines = _Lines()
-    csv.writer(lines).writerows(rows)  # Its own end of line, so that it quotes "\r" and "\n".
-    return "".join(lines)
-
-
-def csv_separator(line: str) -> str:
-    """The separator of a CSV file by its first line: spreadsheets may use another than a comma."""
-    return max(",;\t", key=line.count)
-
-
-class _Lines(list[str]):
-    """Takes the lines of a CSV writer, one at a time."""
-
-    def write(self, line: str) -> None:
-        self.append(line.removesuffix("\r\n") + "\n")
 
 
 def value_from(tag: Tag, text: str, *, states: bool = True, is_measurement: bool = False) -> Any:

@@ -8,12 +8,10 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from holdfast.cli import terminal_text
+from holdfast.cli.live import highlight
 from holdfast.cli.live.changes import Tracker
 from holdfast.cli.live.screen import (
     CUT,
-    FADE_READINGS,
-    FRESH,
-    RECENT,
     Screen,
     whole,
     with_whole_parts,
@@ -87,12 +85,9 @@ class View(Screen):
         return lines
 
     def _style(self, index: int, address: int) -> str:
-        age = self._tracker.age(index, address)
         if self.error is not None:
             return "dim"
-        if age is None or age >= FADE_READINGS:
-            return ""
-        return FRESH if age == 0 else RECENT
+        return highlight.style(self._tracker.age(index, address))
 
     def foot(self, width: int) -> list[Text]:
         """The latest changes: value, rate and number of changes."""

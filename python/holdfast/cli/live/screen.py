@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 SIZE_CHECK_INTERVAL_S = 0.2
 """Between two checks of the size of the terminal."""
 
-FADE_READINGS = 3
-"""A change stays highlighted for so many readings."""
-
 MIN_BODY_LINES = 3
 """The lines of a page that the foot leaves on a terminal with few lines: a heading and two more."""
 
@@ -43,9 +40,6 @@ GAP = "   "
 
 CUT = "…"
 """Stands for what has no room on a line."""
-
-FRESH = "bold reverse yellow"
-RECENT = "bold yellow"
 
 TURNS = {
     **dict.fromkeys(("n", " ", "\x1b[6~", "\x1b[B"), 1),

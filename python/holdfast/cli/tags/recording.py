@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 from holdfast.cli import terminal_text
 from holdfast.events import log_lines
 from holdfast.runtime.text import MAX_CHARACTERS
-from holdfast.tags.text import csv_lines, text_of
+from holdfast.tags.csv_text import csv_lines
+from holdfast.tags.text import text_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

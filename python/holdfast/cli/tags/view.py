@@ -9,7 +9,8 @@ from rich.cells import cell_len, set_cell_size
 from rich.text import Text
 
 from holdfast.cli import terminal_text
-from holdfast.cli.live.screen import CUT, FADE_READINGS, FRESH, RECENT, Screen
+from holdfast.cli.live import highlight
+from holdfast.cli.live.screen import CUT, Screen
 from holdfast.cli.tags.changes import TagTracker
 from holdfast.cli.tags.read import value_shown
 
@@ -90,9 +91,7 @@ class _Row:
             error = "" if tracker.error is not None else str(tracked.error)
             self.note = ": ".join(part for part in (old, terminal_text.plain(error)) if part)
         else:
-            age = tracker.age(tracked)
-            if age is not None and age < FADE_READINGS:
-                self._style = FRESH if age == 0 else RECENT
+            self._style = highlight.style(tracker.age(tracked)) or self._style
 
     def lines(self, names: int, values: int, units: int, width: int) -> list[Text]:
         """The row for columns of these widths."""

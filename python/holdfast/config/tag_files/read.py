@@ -20,7 +20,8 @@ from holdfast.config.values.tag_scale import FORMS, PLACE_KEYS
 from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import listing
 from holdfast.tags import TagList
-from holdfast.tags.text import csv_separator, decimal_comma
+from holdfast.tags.csv_text import csv_separator
+from holdfast.tags.text import decimal_comma
 from holdfast.types import KNOWN_AREAS
 
 if TYPE_CHECKING:

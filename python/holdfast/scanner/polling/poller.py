@@ -46,7 +46,7 @@ MAX_LAG_S = 1.0
 
 FIRST_POLL_SPREAD_S = 1.0
 """Time over which the first polls of new devices are spread; for devices of the configuration, the
-`FIRST_POLL_SPREAD` of crates/engine/src/poller/schedule.rs."""
+`MAX_FIRST_POLL_SPREAD` of crates/engine/src/poller/schedule.rs."""
 
 PREFIX = "nats/"
 """The beginning of the names of devices in the poller. Names in a configuration have no slash."""

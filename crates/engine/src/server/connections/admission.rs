@@ -245,8 +245,7 @@ impl Table {
         }
     }
 
-    /// Makes sure that there is a place for a handshake. The oldest handshake gives way: one that
-    /// takes its time is more likely a peer that never completes it.
+    /// Makes sure that there is a place for a handshake.
     fn clear_handshake(&mut self, source: IpAddr, most: usize) -> Result<Option<Evicted>, Full> {
         let places = self.places(source);
         if let Some(crowd) = self.crowd(source)
@@ -262,9 +261,7 @@ impl Table {
         } else {
             Crowd::All
         };
-        let is_evictable = |held: &Held| held.task.is_some() && crowd.has(held);
-        let oldest = self.handshakes.iter().find(|(_, held)| is_evictable(held));
-        let id = *oldest.ok_or(Full)?.0;
+        let id = crowd.first_handshake_to_go(&self.handshakes).ok_or(Full)?;
         Ok(self.end(id).map(|held| Evicted::Handshake(held.peer)))
     }
 

@@ -1,10 +1,10 @@
-//! Which session of a full listener or HTTP host is closed for a new one.
+//! Which connection of a full listener or HTTP host is closed for a new one.
 //!
 //! A session that has had its last reply always gives way. With
 //! [`WhenFull::Evict`](super::admission::WhenFull::Evict), the others give way in the order of
 //! [`Standing`].
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::net::IpAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -45,6 +45,13 @@ impl Crowd {
                 && held.activity.is_answered.load(Ordering::Relaxed)
         };
         sessions.iter().filter(|(_, held)| is_answered(held)).map(|(id, _)| *id).min()
+    }
+
+    /// The first of these handshakes to give way. It is the oldest: one that takes its time is more likely a
+    /// peer that never completes it.
+    pub(super) fn first_handshake_to_go(self, handshakes: &BTreeMap<u64, Held>) -> Option<u64> {
+        let may_go = |held: &Held| held.task.is_some() && self.has(held);
+        handshakes.iter().find(|(_, held)| may_go(held)).map(|(id, _)| *id)
     }
 
     /// The first of these sessions to give way; `None` if none may. `next_unserved` is when one that had no
