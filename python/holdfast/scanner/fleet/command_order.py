@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from bisect import bisect_left, insort
-from operator import itemgetter
-
-_NUMBER = itemgetter(0)
 
 
 class CommandOrder:
@@ -29,15 +26,15 @@ class CommandOrder:
     def wait(self, number: int) -> asyncio.Event:
         """Adds a command, also one that comes back. Returns the event that it may have the turn."""
         changed = asyncio.Event()
-        insort(self._waiting, (number, changed), key=_NUMBER)
+        insort(self._waiting, (number, changed))
         self._going.pop(number, None)
         self.release(number)
         return changed
 
     def take(self, number: int) -> bool:
         """Takes the turn. Returns whether this command has it now."""
-        is_next = self._waiting[0][0] == number > next(reversed(self._going), -1)
-        if self._turn is not None or not is_next:
+        last = next(reversed(self._going), -1)
+        if self._turn is not None or number != self._waiting[0][0] or number < last:
             return False
         del self._waiting[0]
         self._going[number] = None
@@ -48,7 +45,7 @@ class CommandOrder:
         """Lets the next one take the turn, if this command has it: it is on its way."""
         if self._turn == number:
             self._turn = None
-        if self._turn is None and self._waiting:
+        if self._waiting:
             self._waiting[0][1].set()
 
     def is_overtaken(self, number: int) -> bool:
@@ -61,5 +58,5 @@ class CommandOrder:
             del self._going[number]
             self._last_ended = max(self._last_ended, number)
         else:
-            del self._waiting[bisect_left(self._waiting, number, key=_NUMBER)]
+            del self._waiting[bisect_left(self._waiting, (number,))]
         self.release(number)

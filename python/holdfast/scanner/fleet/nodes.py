@@ -117,9 +117,8 @@ class OtherNodes:
         number = next(self._numbers)
 
         def last_moment() -> float:
-            seconds = remaining_s()
             order.release(number)
-            return seconds
+            return remaining_s()
 
         def sent() -> None:
             if not gives_up_at:  # Else it may come back again: the next one waits for its answer.
