@@ -210,8 +210,11 @@ class Move:
             for _turn in range(20):  # Its subscriptions are read.
                 await asyncio.sleep(0)
             last_moment()
-            if (await self._answer(text)).moved:
+            executed = await self._answer(text)
+            if executed.moved:
                 raise Moved
+            if executed.error is not None:
+                raise Refused(executed.error)
 
         write = self._others.write(self._device, "t", text, own, lambda: 10.0)
         return asyncio.create_task(write)
@@ -291,6 +294,38 @@ def test_a_command_that_comes_back_is_not_written_after_a_later_one(
     assert move.written == ["1"]
 
 
+@pytest.mark.parametrize("is_own", [True, False])
+def test_a_command_that_comes_back_is_written_although_a_later_one_was_refused(
+    monkeypatch: pytest.MonkeyPatch, *, is_own: bool
+) -> None:
+    async def work() -> None:
+        first, second = move.begin("0"), move.begin("1")
+        await move.until_on_their_way(2)
+        move.answers["1"].set_result(Executed(success=False, error="1 is not a value of t"))
+        with pytest.raises(Refused, match="1 is not a value of t"):
+            await second
+        move.moves = False
+        move.answers["0"].set_result(MOVED)
+        await first
+
+    monkeypatch.setattr(nodes, "RETRY_S", 0.0)
+    move = Move(monkeypatch, is_own=is_own)
+    asyncio.run(work())
+    assert move.written == ["0"]
+
+
+def test_the_latest_command_that_was_written_overtakes_whatever_ends_after_it() -> None:
+    order = CommandOrder()
+    for number in (0, 1, 2):
+        order.wait(number)
+        assert order.take(number)
+        order.release(number)
+    order.wait(1)
+    order.end(2, may_be_written=True)
+    order.end(0, may_be_written=True)
+    assert order.is_overtaken(1)
+
+
 def test_the_next_command_waits_for_the_answer_of_one_that_came_back(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -344,7 +379,7 @@ def test_a_burst_of_commands_is_ordered_with_few_comparisons() -> None:
     for number in numbers:
         assert order.take(number)
         order.release(number)
-        order.end(number)
+        order.end(number, may_be_written=True)
     assert len(compared) < 100 * len(numbers)
 
 

@@ -21,7 +21,8 @@ class CommandOrder:
         self._going: dict[int, None] = {}
         """Those that have or had the turn, until they come back or end. In order: what is added is
         later than all of them."""
-        self._last_ended = -1
+        self._last_written = -1
+        """The latest that has ended and may have been carried out."""
 
     def wait(self, number: int) -> asyncio.Event:
         """Adds a command, also one that comes back. Returns the event that it may have the turn."""
@@ -50,13 +51,14 @@ class CommandOrder:
 
     def is_overtaken(self, number: int) -> bool:
         """Whether a later command has ended, and may have been carried out."""
-        return number < self._last_ended
+        return number < self._last_written
 
-    def end(self, number: int) -> None:
+    def end(self, number: int, *, may_be_written: bool) -> None:
         """Removes a command, wherever it is."""
         if number in self._going:
             del self._going[number]
-            self._last_ended = max(self._last_ended, number)
+            if may_be_written:
+                self._last_written = max(self._last_written, number)
         else:
             del self._waiting[bisect_left(self._waiting, (number,))]
         self.release(number)

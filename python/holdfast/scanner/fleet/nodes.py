@@ -115,6 +115,7 @@ class OtherNodes:
         why, gives_up_at = f"no node polls {device.id} now", 0.0
         order = self._orders.setdefault(device.id, CommandOrder())
         number = next(self._numbers)
+        may_be_written = True
 
         def last_moment() -> float:
             order.release(number)
@@ -151,8 +152,11 @@ class OtherNodes:
                 gives_up_at = gives_up_at or now + self._move_timeout_s
                 if now > gives_up_at:
                     raise Refused(f"not written: {why}")
+        except Refused as refused:
+            may_be_written = isinstance(refused, NotConfirmed)
+            raise
         finally:
-            order.end(number)
+            order.end(number, may_be_written=may_be_written)
 
     async def _forward(
         self,
