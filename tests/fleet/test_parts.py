@@ -276,22 +276,23 @@ def test_a_command_that_comes_back_is_not_written_after_a_later_one(
     monkeypatch: pytest.MonkeyPatch, *, is_own: bool
 ) -> None:
     async def work() -> None:
-        first, second = move.begin("0"), move.begin("1")
-        await move.until_on_their_way(2)
+        first, second, third = (move.begin(text) for text in "012")
+        await move.until_on_their_way(3)
         move.answers.pop("0").set_result(MOVED)
         for _turn in range(100):
             await asyncio.sleep(0)
-        assert move.answers.keys() == {"1"}, "it waits: the later one may come back, too"
-        move.moves = False
+        assert move.answers.keys() == {"1", "2"}, "it waits: the later ones may come back, too"
         move.answers["1"].set_result(CARRIED_OUT)
         await second
         with pytest.raises(Refused, match="a later command to d went before it; send it again"):
-            await first
+            await asyncio.wait_for(first, 10)
+        move.answers["2"].set_result(CARRIED_OUT)
+        await third
 
     monkeypatch.setattr(nodes, "RETRY_S", 0.0)
     move = Move(monkeypatch, is_own=is_own)
     asyncio.run(work())
-    assert move.written == ["1"]
+    assert move.written == ["1", "2"]
 
 
 @pytest.mark.parametrize("is_own", [True, False])

@@ -130,7 +130,7 @@ class OtherNodes:
                 changed = order.wait(number)
                 if gives_up_at:
                     await asyncio.sleep(RETRY_S)
-                while not order.take(number):
+                while not (order.is_overtaken(number) or order.take(number)):
                     changed.clear()
                     await tasks.within(remaining_s(), changed.wait())
                 # Each time: it may have waited, and the address of the device may change meanwhile.
