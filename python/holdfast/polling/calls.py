@@ -28,7 +28,10 @@ class Calls(asyncio.Protocol):
         return calls
 
     def result(self, ticket: int) -> asyncio.Future[tuple[bool, Any]]:
-        """The end of a call: whether it was sent, and a result or a `ModbusError`."""
+        """The end of a call: whether it was sent, and a result or an error.
+
+        A `ModbusError`, or a `PermissionError` if the connection leads to none of the peers.
+        """
         future: asyncio.Future[tuple[bool, Any]] = self._loop.create_future()
         self._futures[ticket] = future
         future.add_done_callback(lambda _: self._futures.pop(ticket))
