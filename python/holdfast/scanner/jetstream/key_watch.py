@@ -99,7 +99,7 @@ class KeyWatch:
         self._client: Client | None = None
         self._has_new_client = asyncio.Event()
         self._known: set[str] = set()
-        """The keys that the bucket has, as far as it is known."""
+        """The keys that the bucket has, as far as it is known: the log has how many are lost."""
         events = "bucket_watched", "bucket_not_watched"
         self._availability = Availability(*events, bucket=bucket)
         self._backoff = Backoff(FIRST_RETRY_S, times.retry_s, jitter=True)
@@ -148,7 +148,10 @@ class KeyWatch:
     async def _follow(self, client: Client) -> None:
         """Reads all keys, then reports changes. Raises `_Missed`, or an error of JetStream."""
         jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
-        await self._open(jetstream)
+        try:
+            await jetstream.stream_info(f"KV_{self._bucket}")
+        except NotFoundError:
+            await jetstream.create_key_value(bucket=self._bucket, history=1)
         async with reading(jetstream, self._bucket, self._keys) as reader:
             found = await reader.fetch_all()
             if lost := len(self._known - found.keys()):
@@ -166,12 +169,6 @@ class KeyWatch:
         self._known -= changes.keys()
         self._known |= {key for key, written in changes.items() if written is not None}
         await self._on_change(changes)
-
-    async def _open(self, jetstream: JetStreamContext) -> None:
-        try:
-            await jetstream.stream_info(f"KV_{self._bucket}")
-        except NotFoundError:
-            await jetstream.create_key_value(bucket=self._bucket, history=1)
 
 
 class Reader:
