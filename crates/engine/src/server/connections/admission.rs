@@ -23,7 +23,7 @@ pub enum WhenFull {
     /// The new connection is closed.
     Refuse,
     /// The connection that has been idle longest is closed. One that waits for a reply of Modbus, or is in the
-    /// middle of a Raw Ingest packet, is closed only if all are like it.
+    /// middle of a Raw Ingest packet, is closed only if all do or are.
     Evict,
 }
 
@@ -369,7 +369,7 @@ impl Ticket {
     #[inline]
     pub(crate) fn touch_modbus(&self, now: Instant, awaits_reply: bool) {
         self.touch(now);
-        self.activity.awaits_reply.store(awaits_reply, Ordering::Relaxed);
+        self.set_amid_exchange(awaits_reply);
     }
 
     /// Records the certificate that the peer has proved to own.
@@ -389,14 +389,14 @@ impl Ticket {
     /// Records what a connection of HTTP waits for, and since when.
     pub(crate) fn wait(&self, waiting: WaitingFor, since: Instant) {
         self.touch(since);
-        self.set_amid_packet(waiting == WaitingFor::Rest);
+        self.set_amid_exchange(waiting == WaitingFor::Rest);
         self.activity.is_busy.store(waiting == WaitingFor::Handler, Ordering::Relaxed);
         self.activity.is_served.store(waiting == WaitingFor::NextRequest, Ordering::Relaxed);
     }
 
-    /// Records whether part of a packet has arrived.
-    pub(crate) fn set_amid_packet(&self, is_amid_packet: bool) {
-        self.activity.is_amid_packet.store(is_amid_packet, Ordering::Relaxed);
+    /// Records whether part of a packet has arrived, or a reply comes later.
+    pub(crate) fn set_amid_exchange(&self, is_amid_exchange: bool) {
+        self.activity.is_amid_exchange.store(is_amid_exchange, Ordering::Relaxed);
     }
 
     /// Records that the connection has had its last reply: it gives its place to any other one.

@@ -81,8 +81,7 @@ impl Crowd {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Standing {
     Idle,
-    AwaitsReply,
-    AmidPacket,
+    AmidExchange,
     /// It has just had its response.
     JustServed,
 }
@@ -104,9 +103,8 @@ pub(super) struct Activity {
     /// In microseconds since the epoch of the admission. A reply that comes later counts as a request. Before any,
     /// when it was admitted.
     pub(super) last_request: AtomicU64,
-    pub(super) is_amid_packet: AtomicBool,
-    /// Whether the peer waits for a reply of Modbus that comes later.
-    pub(super) awaits_reply: AtomicBool,
+    /// Whether part of a packet or of a request of HTTP has arrived, or a reply of Modbus comes later.
+    pub(super) is_amid_exchange: AtomicBool,
     /// Whether the peer waits for a response of HTTP that takes its time.
     pub(super) is_busy: AtomicBool,
     /// Whether `last_request` is the time of the last response.
@@ -124,10 +122,8 @@ impl Held {
         let last_request = self.activity.last_request.load(Ordering::Relaxed);
         let has_no_request = last_request == self.admitted;
         let longer = if has_no_request { LONGER_WITHOUT_REQUEST.as_micros() as i128 } else { 0 };
-        let standing = if self.activity.is_amid_packet.load(Ordering::Relaxed) {
-            Standing::AmidPacket
-        } else if self.activity.awaits_reply.load(Ordering::Relaxed) {
-            Standing::AwaitsReply
+        let standing = if self.activity.is_amid_exchange.load(Ordering::Relaxed) {
+            Standing::AmidExchange
         } else if self.waited(now) < grace {
             Standing::JustServed
         } else {
@@ -138,8 +134,8 @@ impl Held {
 
     /// Whether it may be closed for another connection now.
     fn may_go(&self, now: u64, grace: u64) -> bool {
-        let Activity { is_amid_packet, is_busy, .. } = &*self.activity;
-        let grace = match is_amid_packet.load(Ordering::Relaxed) {
+        let Activity { is_amid_exchange, is_busy, .. } = &*self.activity;
+        let grace = match is_amid_exchange.load(Ordering::Relaxed) {
             true => grace,
             false if self.is_served() => 0,
             false => grace.min(FIRST_BYTES_TIME.as_micros() as u64),
@@ -269,17 +265,17 @@ mod tests {
             (ticket, evicted)
         };
         let tickets = [1, 2, 3].map(|port| admit(port).0);
-        tickets[0].set_amid_packet(true);
-        tickets[2].set_amid_packet(true);
+        tickets[0].set_amid_exchange(true);
+        tickets[2].set_amid_exchange(true);
         let (_fourth, evicted) = admit(4);
         assert_eq!(evicted, Some(session(1, 2)));
         let (fifth, evicted) = admit(5);
         assert_eq!(evicted, Some(session(1, 4)), "the silent one, although it is the newest");
-        fifth.set_amid_packet(true);
+        fifth.set_amid_exchange(true);
         let (sixth, evicted) = admit(6);
         assert_eq!(evicted, Some(session(1, 1)), "all are in the middle of a packet");
-        sixth.set_amid_packet(true);
-        fifth.set_amid_packet(false);
+        sixth.set_amid_exchange(true);
+        fifth.set_amid_exchange(false);
         assert_eq!(admit(7).1, Some(session(1, 5)), "its packet is complete");
     }
 

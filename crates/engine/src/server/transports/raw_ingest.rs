@@ -448,7 +448,7 @@ impl RawIngest {
     ) -> Result<Result<(), Refusal>, Kind> {
         let deadline = Instant::now() + self.request_timeout;
         loop {
-            sending.ticket.set_amid_packet(sending.is_amid_packet());
+            sending.ticket.set_amid_exchange(sending.is_amid_packet());
             self.renew(sending, renewal)?;
             let missing = match self.judge(&sending.rights, &sending.bytes) {
                 Ok(Packet::Incomplete { missing }) => missing,
@@ -499,7 +499,7 @@ impl RawIngest {
             Err(refusal) => Err(refusal),
         };
         sending.share.charge(worker_share::packet(sending.bytes.len() - behind));
-        sending.ticket.set_amid_packet(false);
+        sending.ticket.set_amid_exchange(false);
         if let Err(refusal) = written {
             self.refuse(&context, &sending.peer, &sending.bytes, refusal);
             sending.bytes.clear();
@@ -574,7 +574,7 @@ impl RawIngest {
                     sending.bytes.consume(answered);
                     answered = 0;
                     let was_empty = !sending.is_amid_packet();
-                    sending.ticket.set_amid_packet(!was_empty);
+                    sending.ticket.set_amid_exchange(!was_empty);
                     let time_limit = if was_empty { self.idle } else { self.request_timeout };
                     let read = tokio::select! {
                         read = timeout_at(begun + time_limit, sending.read(usize::MAX)) => read,
@@ -585,7 +585,7 @@ impl RawIngest {
                             if was_empty {
                                 begun = Instant::now();
                             }
-                            sending.ticket.set_amid_packet(sending.is_amid_packet());
+                            sending.ticket.set_amid_exchange(sending.is_amid_packet());
                             if let Err(slow) = self.flush(&mut sending).await {
                                 end = slow;
                                 break;
@@ -612,7 +612,7 @@ impl RawIngest {
                 }
                 Err(refusal) => refusal,
             };
-            sending.ticket.set_amid_packet(false);
+            sending.ticket.set_amid_exchange(false);
             self.refuse(&context, &sending.peer, &sending.bytes[answered..], refusal);
             sending.bytes.clear();
             answered = 0;
@@ -775,7 +775,7 @@ impl Service for RawIngest {
             bytes = &bytes[self.dialect.format.packet_len(&header)..];
             answer(&mut connection.stream, &mut Vec::new(), &connection.ticket, DONE);
         } else {
-            connection.ticket.set_amid_packet(len > 0);
+            connection.ticket.set_amid_exchange(len > 0);
         }
         connection.received = bytes.to_vec();
         connection

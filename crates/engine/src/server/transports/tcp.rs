@@ -178,7 +178,7 @@ impl ModbusStream {
             match Beginning::of(&admitted.received) {
                 Beginning::Unknown => {}
                 Beginning::Modbus => {
-                    admitted.ticket.set_amid_packet(false);
+                    admitted.ticket.set_amid_exchange(false);
                     return self
                         .connection::<MbapBesidePackets>(live, context, admitted, stop)
                         .await;
@@ -216,7 +216,7 @@ impl ModbusStream {
                     Ok(0) => return context.ended(Kind::Closed, peer),
                     Ok(len) => {
                         admitted.received.extend_from_slice(&chunk[..len]);
-                        admitted.ticket.set_amid_packet(true);
+                        admitted.ticket.set_amid_exchange(true);
                     }
                     Err(error) if error.kind() == ErrorKind::WouldBlock => {}
                     Err(_) => return context.ended(Kind::Closed, peer),
