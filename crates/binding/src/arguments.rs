@@ -49,6 +49,15 @@ pub fn time_to_wait(what: &str, time: f64) -> PyResult<Duration> {
     Ok(time)
 }
 
+/// Parses IP addresses, to their canonical form.
+pub fn ip_addresses(what: &str, texts: &[String]) -> PyResult<Vec<IpAddr>> {
+    let parsed = texts.iter().map(|text| match text.parse::<IpAddr>() {
+        Ok(address) => Ok(address.to_canonical()),
+        Err(_) => Err(unknown(what, text, "IP addresses")),
+    });
+    parsed.collect()
+}
+
 pub fn address(text: &str) -> PyResult<SocketAddr> {
     let form = "address:port as in 127.0.0.1:502 or [::1]:502";
     text.parse().map_err(|_| unknown("bind", text, form))

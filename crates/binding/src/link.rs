@@ -1,6 +1,5 @@
 //! `Link`, `Route`, `Withdrawal`, `Passage` and `Caller`: devices that listeners and event loops ask.
 
-use std::net::IpAddr;
 use std::sync::{Arc, Mutex};
 
 use holdfast_engine::Wakes;
@@ -17,7 +16,7 @@ use pyo3::exceptions::{PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyDict};
 
-use crate::arguments::{byte, seconds, within};
+use crate::arguments::{byte, ip_addresses, seconds, within};
 use crate::client::{Endpoint, Request, exception, response, value};
 use crate::memory::named;
 
@@ -44,12 +43,8 @@ pub(crate) fn settings(
     queue: Option<i128>,
     coalesce: bool,
     cache: f64,
-    preferred: Vec<String>,
+    preferred: &[String],
 ) -> PyResult<LinkSettings> {
-    let parsed = |text: String| {
-        let invalid = || PyValueError::new_err(format!("preferred: {text} is not an IP address"));
-        text.parse::<IpAddr>().map(|peer| peer.to_canonical()).map_err(|_| invalid())
-    };
     Ok(LinkSettings {
         endpoint: endpoint.core.clone(),
         in_flight: in_flight(number)?,
@@ -59,7 +54,7 @@ pub(crate) fn settings(
         })?,
         coalesce,
         cache: seconds("cache", cache)?,
-        preferred: preferred.into_iter().map(parsed).collect::<PyResult<_>>()?,
+        preferred: ip_addresses("preferred", preferred)?,
     })
 }
 
@@ -113,15 +108,8 @@ impl Link {
         peers: Option<Vec<String>>,
     ) -> PyResult<Option<u64>> {
         let (unit_id, timeout) = (byte("unit", unit)?, seconds("timeout", timeout)?);
-        let address = |text: &String| {
-            let error =
-                |_| PyValueError::new_err(format!("peers: found {text}, allowed: addresses"));
-            text.parse::<IpAddr>().map_err(error)
-        };
-        let peers = match peers {
-            Some(all) => Peers::only(all.iter().map(address).collect::<PyResult<Vec<_>>>()?),
-            None => Peers::default(),
-        };
+        let peers = peers.map(|all| ip_addresses("peers", &all)).transpose()?;
+        let peers = peers.map_or_else(Peers::default, Peers::only);
         Ok(self.core.call(&caller.core, unit_id, &request.encoded, timeout, broadcast, peers))
     }
 

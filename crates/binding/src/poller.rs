@@ -192,7 +192,7 @@ impl Poller {
     ) -> PyResult<Link> {
         let preferred = preferred.unwrap_or_default();
         let settings =
-            link::settings(&endpoint, (in_flight, retry), queue, coalesce, cache, preferred)?;
+            link::settings(&endpoint, (in_flight, retry), queue, coalesce, cache, &preferred)?;
         Ok(Link { core: self.core.link(settings).map_err(to_py_err)? })
     }
 

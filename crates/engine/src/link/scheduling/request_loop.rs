@@ -201,12 +201,10 @@ impl Serving {
             }
             // Nobody replies to a broadcast: it shows that the line can be used, not that a unit answers.
             Ok(pdu) if pdu.is_empty() => {
-                let has_no_reply = |error: Arc<ClientError>| {
-                    use ClientError::{Incomplete, Invalid, Timeout};
-                    matches!(*error, Timeout(_) | Incomplete(_) | Invalid(_))
-                };
-                if !shared.error().is_some_and(has_no_reply) {
-                    shared.set_error(None);
+                use ClientError::{Incomplete, Invalid, Timeout};
+                match shared.error().as_deref() {
+                    Some(Timeout(_) | Incomplete(_) | Invalid(_)) => {}
+                    _ => shared.set_error(None),
                 }
             }
             _ => {

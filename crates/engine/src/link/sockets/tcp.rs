@@ -138,13 +138,13 @@ impl TcpLink {
             if self.open.borrow().is_none() {
                 self.connect(deadline, timeout, eager, permit).await?;
             }
-            if let Some(open) = self.open.borrow().as_ref()
-                && !permit.peers.hold(open.peer)
-            {
-                return Err(Arc::new(ClientError::Elsewhere));
-            }
-            if let (Some(open), Some(fence)) = (self.open.borrow_mut().as_mut(), &permit.fence) {
-                open.pass.get_or_insert_with(|| fence.pass());
+            if let Some(open) = self.open.borrow_mut().as_mut() {
+                if !permit.peers.hold(open.peer) {
+                    return Err(ClientError::Elsewhere.into());
+                }
+                if let Some(fence) = &permit.fence {
+                    open.pass.get_or_insert_with(|| fence.pass());
+                }
             }
             permit.check(true)?;
             let began = pace.began();
