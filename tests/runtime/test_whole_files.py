@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from typing import TYPE_CHECKING
 
 import pytest
@@ -12,6 +13,8 @@ from holdfast.runtime import whole_files
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="no modes, owners and such pipes")
 
 
 @pytest.fixture
@@ -31,13 +34,38 @@ def test_a_file_keeps_its_mode_and_a_new_one_has_that_of_the_process(tmp_path: P
     assert (new.stat().st_mode & 0o777, old.stat().st_mode & 0o777) == (0o600, 0o664)
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
-def test_a_file_keeps_its_owner(tmp_path: Path) -> None:
+def test_a_file_keeps_its_owner_but_not_one_with_a_secret(tmp_path: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root gives files away")
     file = tmp_path / "file"
     file.write_bytes(b"1")
+    file.chmod(0o666)
     os.chown(file, 1234, 5678)
     whole_files.replace(file, b"2")
     assert (file.stat().st_uid, file.stat().st_gid, file.read_bytes()) == (1234, 5678, b"2")
+    whole_files.replace(file, b"3", whole_files.SECRET)
+    assert (file.stat().st_uid, file.stat().st_gid) == (os.geteuid(), os.getegid())
+    assert (file.stat().st_mode & 0o777, file.read_bytes()) == (0o600, b"3")
+
+
+def test_a_private_file_is_private_while_it_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    modes = list[int]()
+    file = tmp_path / "file"
+    file.write_bytes(b"1")
+    file.chmod(0o600)
+    monkeypatch.setattr(os, "fsync", lambda number: modes.append(os.fstat(number).st_mode & 0o777))
+    whole_files.replace(file, b"2")
+    assert modes == [0o600]
+
+
+def test_a_long_name_leaves_room_for_the_name_of_the_new_file(tmp_path: Path) -> None:
+    for letter in "a\N{OLD ITALIC LETTER A}":
+        file = tmp_path / (letter * (255 // len(letter.encode())))
+        file.write_bytes(b"1")
+        whole_files.replace(file, b"2")
+        assert file.read_bytes() == b"2"
 
 
 def test_the_file_behind_a_link_is_replaced(tmp_path: Path) -> None:
@@ -50,6 +78,7 @@ def test_the_file_behind_a_link_is_replaced(tmp_path: Path) -> None:
 
 def test_a_pipe_is_written_to(tmp_path: Path) -> None:
     reading, writing = os.pipe()
+    whole_files.try_replace(tmp_path / f"/dev/fd/{writing}")
     whole_files.replace(tmp_path / f"/dev/fd/{writing}", b"2")
     os.close(writing)
     with os.fdopen(reading, "rb") as pipe:
@@ -70,3 +99,19 @@ def test_a_file_in_a_folder_that_takes_no_other_is_written_in_place(
     assert file.read_bytes() == b"2"
     with pytest.raises(PermissionError):
         whole_files.replace(tmp_path / "new", b"2")
+
+
+def test_a_file_that_can_be_neither_written_nor_given_to_its_owner_is_found_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    file = tmp_path / "file"
+    file.write_bytes(b"1")
+    monkeypatch.setattr(os, "chown", refuse)
+    whole_files.try_replace(file)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(PermissionError):
+        whole_files.try_replace(file)
+    assert list(tmp_path.iterdir()) == [file]

@@ -6,11 +6,12 @@ import errno
 import os
 import stat
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
 
 NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 """Flags for a new file; Windows would convert line ends without `O_BINARY`."""
@@ -49,16 +50,16 @@ def write_new(contents: Mapping[Path, tuple[bytes, int]]) -> None:
 def replace(file: Path, content: bytes, mode: int | None = None) -> None:
     """Writes a file that programs may read at the same time, and that a full disk leaves as it was.
 
-    Without `mode`, a file keeps the one that it has. What can't be replaced is written in place: a
-    pipe, a device, a file of another owner, or one whose folder allows no others. Raises `OSError`.
+    With `mode`, it is always a new file, of this process. Without, a file keeps its owner, group
+    and mode, and what can't be replaced is written in place: a pipe, a device, a file of another
+    owner, or one whose folder allows no others. Raises `OSError`.
     """
-    try:
-        before = file.stat()
-    except FileNotFoundError:
-        before = None
+    before = _before(file) if mode is None else None
     if before is None or stat.S_ISREG(before.st_mode):
+        real = Path(os.path.realpath(file))
         try:
-            _replace(Path(os.path.realpath(file)), content, mode, before)
+            with _beside(real, content, USUAL if mode is None else mode, before) as new:
+                new.replace(real)
             return
         except OSError as error:
             if before is None or error.errno not in _IRREPLACEABLE:
@@ -70,39 +71,34 @@ _IRREPLACEABLE = (errno.EACCES, errno.EPERM, errno.EBUSY, errno.EROFS)
 """Errors of a folder or an owner, or of a file that is mounted alone; the file may be writable."""
 
 
-def _replace(file: Path, content: bytes, mode: int | None, before: os.stat_result | None) -> None:
-    new = _written_beside(file, content, USUAL if mode is None else mode)
-    try:
-        if before is not None:
-            _give(new, before)
-            if mode is None:
-                new.chmod(stat.S_IMODE(before.st_mode))
-        new.replace(file)
-    except BaseException:
-        new.unlink(missing_ok=True)
-        raise
-
-
-def _give(new: Path, before: os.stat_result) -> None:
-    """Gives a file the owner and group of the one that it replaces."""
-    if sys.platform != "win32":
-        made = new.stat()
-        if (made.st_uid, made.st_gid) != (before.st_uid, before.st_gid):
-            os.chown(new, before.st_uid, before.st_gid)
-
-
 def try_replace(file: Path) -> None:
     """Raises `OSError` if a file can't be written by `replace`. Changes nothing."""
+    if not os.access(file, os.W_OK):
+        with _beside(Path(os.path.realpath(file)), b"", USUAL, _before(file)):
+            pass
+
+
+def _before(file: Path) -> os.stat_result | None:
     try:
-        _written_beside(Path(os.path.realpath(file)), b"", USUAL).unlink()
-    except OSError as error:
-        if error.errno not in _IRREPLACEABLE or not os.access(file, os.W_OK):
-            raise
+        return file.stat()
+    except FileNotFoundError:
+        return None
 
 
-def _written_beside(file: Path, content: bytes, mode: int) -> Path:
-    new = file.with_name(f".{file.name}.{os.getpid()}")
+@contextmanager
+def _beside(file: Path, content: bytes, mode: int, before: os.stat_result | None) -> Iterator[Path]:
+    """A new file next to `file`, with the owner and mode of the one before. It is removed if it is
+    not renamed."""
+    # A name has 255 bytes at most, and a character up to 4.
+    new = file.with_name(f".{file.name[:50]}.{os.getpid()}")
     # One that a power cut has left: in a container, the next process has the same number.
     new.unlink(missing_ok=True)
-    write_new({new: (content, mode)})
-    return new
+    try:
+        write_new({new: (content, mode if before is None else SECRET)})
+        if before is not None:
+            if sys.platform != "win32":
+                os.chown(new, before.st_uid, before.st_gid)
+            new.chmod(stat.S_IMODE(before.st_mode))
+        yield new
+    finally:
+        new.unlink(missing_ok=True)
