@@ -53,7 +53,8 @@ def test_a_full_disk_is_one_line_of_error(words: Sequence[str]) -> None:
 
 
 @with_full
-def test_a_full_standard_error_changes_no_exit_code(tmp_path: Path) -> None:
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_a_full_standard_error_changes_no_exit_code(tmp_path: Path, encoding: str) -> None:
     device = "devices: {a: {url: tcp://a, interval: 1, tags: {x: {area: coils, address: %s}}, %s}}"
     wrong, right = tmp_path / "wrong.yaml", tmp_path / "right.yaml"
     wrong.write_text(device % (-1, ""))
@@ -62,6 +63,7 @@ def test_a_full_standard_error_changes_no_exit_code(tmp_path: Path) -> None:
     source.write_text(TELEGRAF)
     # Python prints the error again at its end, unless it does not buffer.
     env = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
+    env["PYTHONIOENCODING"] = encoding
     for words, code in (
         (("check", right), 0),
         (("check", wrong), 2),

@@ -33,7 +33,8 @@ def prepare() -> None:
         if isinstance(stream, io.TextIOWrapper):
             encoding = "utf-8" if is_local and not stream.isatty() else None
             stream.reconfigure(encoding=encoding, errors="backslashreplace")
-    sys.stderr = cast("Any", _Dropping(sys.stderr))
+    if not isinstance(sys.stderr, _Dropping):
+        sys.stderr = cast("Any", _Dropping(sys.stderr))
 
 
 class _Dropping:
@@ -45,7 +46,12 @@ class _Dropping:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
 
-    def write(self, text: str) -> int:
+    @property
+    def buffer(self) -> Any:
+        """The same for bytes, which click writes where the encoding is ASCII."""
+        return _Dropping(self._stream.buffer)
+
+    def write(self, text: str | bytes) -> int:
         """Writes a text if that is possible."""
         with contextlib.suppress(OSError):
             self._stream.write(text)
