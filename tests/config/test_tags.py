@@ -387,7 +387,7 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
         (
             "t.yaml",
             "tags: {a: {area: holding_registers, address: 1, min: 0,05}}\n",
-            "t.yaml:1: tags.a.min: found a decimal comma behind 0, allowed: a decimal point",
+            "t.yaml:1: tags.a.min: found a comma behind 0, allowed: numbers such as 0.1 and 1000",
         ),
         (
             "t.yaml",
@@ -405,9 +405,14 @@ def test_a_tag_with_markers_for_no_value_is_checked_too(tmp_path: Path) -> None:
             "p.yaml:1: devices.a.interval: found '1,000', allowed: a number from 0.01",
         ),
         (
+            "t.csv",
+            "name;area;address;scale\nx;hr;1;1,000\n",
+            "t.csv:2: tags.x.scale: found '1,000', allowed: a number, or a mapping",
+        ),
+        (
             "p.yaml",
-            DEVICE.replace("interval: 1", "interval: '1,5'"),
-            "p.yaml:1: devices.a.interval: '1,5' has a decimal comma, allowed: a decimal point",
+            DEVICE.replace("interval: 1", "interval: '0,250'"),
+            "p.yaml:1: devices.a.interval: '0,250' has a decimal comma, allowed: a decimal point",
         ),
         (
             "t.yaml",

@@ -446,6 +446,7 @@ def test_a_value_is_checked_before_it_is_reviewed(
         ("float32", "1.234,5", "“1.234,5” has a comma between digits. Write a decimal point"),
         ("float32", "1e3,5", "“1e3,5” has a comma between digits"),
         ("float32", "-1,234.5", "“-1,234.5” has a comma between digits"),
+        ("float32", "1,234", "“1,234” has a comma between digits"),
         ("float32", "1 234,5", "“234,5” has a decimal comma"),
         ("uint16", "1,2,3", "“1,2,3” has a comma between digits"),
         ("float32", "1e40", "“1e40” does not fit float32"),

@@ -169,7 +169,8 @@ def test_text_is_parsed_by_the_type_of_the_tag(it: Tag, text: str, value: Any) -
     [
         (tag("float32"), "21,5", "'21,5' has a decimal comma, .* as in 21.5"),
         (tag(scale=0.1), "21,5", "decimal comma"),
-        (tag(), "1,000", "decimal comma"),
+        (tag(), "0,125", "decimal comma"),
+        (tag(), "1,000", "'1,000' is not a number"),
         (tag(), "much", "'much' is not a number"),
         (tag(), "", "'' is not a number"),
         (tag("float32"), "nan", "'nan' is not a number"),

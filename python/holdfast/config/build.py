@@ -90,10 +90,7 @@ def _add(path: KeyPath, error: ErrorDetails, report: Report) -> None:
         words = "an integer" if of_key and kind == "int_type" else f"{allowed(path, data)}{near}"
         words += _in_seconds(error["input"], words)
         found = _shown(path, error["input"])
-        text = str(error["input"])
-        # The comma in 1,000 may be that of thousands.
-        may_cut = words.startswith("a number") and re.search(",[0-9]{3}$", text) is None
-        comma = decimal_comma(text) if may_cut else None
+        comma = decimal_comma(str(error["input"])) if words.startswith("a number") else None
         message = f"found {found}, allowed: {words}" if comma is None else f"{found} {comma}"
         report.add(path, message)
 
@@ -145,8 +142,8 @@ def _add_unknown(path: KeyPath, report: Report) -> None:
     if (blank := foreign_space(str(key))) is not None:
         report.add_key(path, f"found {blank} before the key, allowed: spaces")
     elif isinstance(key, int) and (cut := _cut_number(path, report, len(known))) is not None:
-        found = f"found a decimal comma behind {report.raw(cut)}"
-        report.add_final(cut, f"{found}, allowed: a decimal point, as in 0.1")
+        found = f"found a comma behind {report.raw(cut)}"
+        report.add_final(cut, f"{found}, allowed: numbers such as 0.1 and 1000")
     else:
         words = f"allowed: {listing(known)}{suggestion(key, known)}"
         report.add_key(path, f"unknown key, {words}")

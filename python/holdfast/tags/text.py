@@ -33,7 +33,8 @@ MAX_PLACES = 6
 _INTEGER = re.compile(r"[+-]?[0-9]{1,40}")
 _HEX = re.compile(r"0[xX][0-9a-fA-F]{1,16}")
 _DECIMAL = re.compile(r"[+-]?([0-9]{1,40}\.?[0-9]{0,40}|\.[0-9]{1,40})([eE][+-]?[0-9]{1,3})?")
-_COMMA = re.compile(r"[+-]?[0-9]{0,40},[0-9]{1,40}([eE][+-]?[0-9]{1,3})?")
+_THOUSANDS = r"[+-]?[1-9][0-9]{0,2},[0-9]{3}"
+_COMMA = re.compile(rf"(?!{_THOUSANDS}$)[+-]?[0-9]{{0,40}},[0-9]{{1,40}}([eE][+-]?[0-9]{{1,3}})?")
 
 
 def plain(tag: Tag, value: Any) -> Any:
@@ -105,7 +106,7 @@ def value_from(tag: Tag, text: str, *, states: bool = True, is_measurement: bool
 
 
 def decimal_comma(word: str) -> str | None:
-    """What to say of a number with a decimal comma; `None` for other words."""
+    """What to say of a number with a decimal comma; `None` for other words, and for 1,000."""
     if _COMMA.fullmatch(word) is None:
         return None
     return f"has a decimal comma, allowed: a decimal point, as in {word.replace(',', '.')}"

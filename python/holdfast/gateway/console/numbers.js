@@ -61,7 +61,7 @@ export function separated(text) {
   const words = text.match(/[^\s;]+/g) ?? [];
   const doubtful = words.find((word) => word.replace(/0(x[\da-f]+|b[01]+),/gi, "").match(/\d,\d/));
   if (doubtful === undefined) return text.split(/[;,]/);
-  const isOne = /^[+-]?\d+,\d+([eE][-+]?\d+)?$/.test(doubtful);
+  const isOne = /^(?![+-]?[1-9]\d{0,2},\d{3}$)[+-]?\d+,\d+([eE][-+]?\d+)?$/.test(doubtful);
   const advice = isOne ? `Write ${doubtful.replace(",", ".")} for one value, or ${doubtful.replace(",", "; ")} for two`
     : "Write a decimal point, nothing between thousands, and semicolons between values";
   throw new Error(`“${doubtful}” has ${isOne ? "a decimal comma" : "a comma between digits"}. ${advice}.`);
