@@ -303,7 +303,7 @@ def _warnings(scope: Scope, path: KeyPath, device: DeviceConfig) -> Iterator[tup
         yield (*path, "writes"), f"{message} into holding registers"
     if device.is_polled and device.interval is not None:
         pauses, requests = _pauses(scope.config, str(path[-1]), device)
-        if pauses > device.interval * (1 + 1e-9):  # 3 × 0.1 is more than 0.3.
+        if round(pauses, 9) > device.interval:
             found = f"found {device.interval:g}, but the pauses of {counted(requests, 'request')}"
             yield (*path, "interval"), f"{found} take {pauses:g} s in each poll: polls are late"
     stored = any(read.into is not None for read in device.reads)

@@ -112,9 +112,8 @@ class TagConfig(Model):
                 _made(name, settings)
                 return
             except TagError as error:
-                value = settings.pop(error.key, None)
-                is_register = isinstance(value, ScaleConfig)
-                needed = _PLACE if is_register else JUDGED_WITH.get(error.key, ())
+                is_register = isinstance(settings.pop(error.key, None), ScaleConfig)
+                needed = {"area", "address"} if is_register else JUDGED_WITH.get(error.key, ())
                 if wrong.isdisjoint((error.key, *needed)):
                     yield error
                 wrong.add(error.key)
@@ -158,7 +157,6 @@ def _made(name: str, settings: Mapping[str, Any]) -> Tag:
 _STAND_INS: dict[str, Any] = {"area": "holding_registers", "address": 0, "type": "uint64"}
 """In place of an invalid area, address or type, so that other keys are judged all the same. Eight
 bytes can have every order."""
-_PLACE = frozenset(("area", "address"))
 
 
 class ProfileConfig(Model):

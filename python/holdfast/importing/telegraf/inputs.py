@@ -271,33 +271,25 @@ def share_connections(desk: Desk, devices: list[Device]) -> None:
         if each.data["url"] is not None:
             groups.setdefault(connection_of(parse(each.data["url"])), []).append(each)
     for group in groups.values():
-        _close_connections(desk, group)
         shared: dict[str, Any] = {}
         for each in group:
             for key, value in each.data.get("tolerance", {}).items():
                 shared[key] = max(value, shared.get(key, value))
             _compare_lines(desk, group[0], each)
+        if shared.get("pause_after_connect"):
+            shared.pop("close_after", None)  # Telegraf connected once for all requests of a poll.
         for each in group:
-            if each.data.get("tolerance", {}) != shared:
+            own = each.data.get("tolerance", {})
+            path = (*each.path[:-1], "workarounds", "close_connection_after_gather")
+            if "close_after" in own and "close_after" in shared:
+                desk.changed(path, "the connection is closed after each request")
+            elif own.pop("close_after", None):
+                message = "the connection stays open: with close_after, each request would wait for"
+                desk.left_out(path, f"{message} pause_after_connect")
+            if own != shared:
                 message = "devices at one address share pauses and retries"
                 desk.changed(each.path[:-1], f"{message}: the largest value of each applies")
                 each.data["tolerance"] = dict(shared)
-
-
-def _close_connections(desk: Desk, group: list[Device]) -> None:
-    """Keeps the connection of devices open if each request would wait after connecting.
-
-    The source connected once for all requests of a poll.
-    """
-    own = [each.data.get("tolerance", {}) for each in group]
-    waits = any(tolerance.get("pause_after_connect") for tolerance in own)
-    for each, tolerance in zip(group, own, strict=True):
-        path = (*each.path[:-1], "workarounds", "close_connection_after_gather")
-        if waits and tolerance.pop("close_after", None):
-            message = "the connection stays open: with close_after, each request would wait for"
-            desk.left_out(path, f"{message} pause_after_connect")
-        elif tolerance.get("close_after"):
-            desk.changed(path, "the connection is closed after each request")
 
 
 def _compare_lines(desk: Desk, first: Device, other: Device) -> None:
