@@ -19,7 +19,7 @@ from holdfast.server import Identity
 from support import cli, lines, wire
 from support.cli import answer, done, failure, usage_error
 from support.commands import Command
-from support.fake_device import FakeDevice, Late, Serial, Stream, exception, registers, silent
+from support.fake_device import FakeDevice, Late, Serial, Stream, Udp, exception, registers, silent
 from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
@@ -288,6 +288,43 @@ def test_a_device_that_ignores_what_comes_first_is_found() -> None:
                 target = [address, option, port]
             shown = cli.invoke(name, *target, "--timeout", "0.3").stdout
         assert "1  answers" in shown or "Unit 1 answers." in shown
+
+
+def test_silence_after_connecting_is_a_hint() -> None:
+    def is_hinted(timeout: float) -> bool:
+        with Stream("tcp", then=silent) as host:
+            for target in ((host.url, "--units", "1-2"), ("127.0.0.1", "--port", str(host.port))):
+                [*told] = failure("find", *target, "--timeout", str(timeout))
+                if not told or f"'{host.url}?pause_after_connect=2'" not in told[-1]:
+                    return False
+        return True
+
+    wire.until_long_enough(is_hinted, "the host accepts connections")
+
+
+@pytest.mark.parametrize(
+    ("kind", "behave"),
+    [
+        ("tcp", lambda asked: asked.answer(exception(asked.pdu, 0x0B))),
+        ("tcp", lambda asked: asked.send(b"HTTP/1.0 400 Bad Request\r\n\r\n")),
+        ("udp", silent),
+        ("rtu+udp", silent),
+    ],
+    ids=["gateway", "web server", "udp", "rtu+udp"],
+)
+def test_unit_ids_that_are_not_silent_after_connecting_are_asked_once(
+    kind: str, behave: Behaviour
+) -> None:
+    is_tcp = kind == "tcp"
+    with Stream(kind, then=behave) if is_tcp else Udp(then=behave, kind=kind) as host:
+        quick = () if is_tcp else ("--timeout", "0.05")
+        assert failure("find", host.url, "--units", "1-2", *quick) == []
+        # Over UDP, a read is sent several times within its timeout.
+        assert [*dict.fromkeys(each.unit for each in host.requests)] == [1, 2]
+        assert host.requests[-1].unit == 2
+        if is_tcp:
+            port = host.url.rpartition(":")[2]
+            assert cli.invoke("find", "127.0.0.1", "--port", port).stderr == ""
 
 
 def test_no_unit_id_is_a_failure() -> None:

@@ -25,6 +25,8 @@ from holdfast.protocol import ILLEGAL_ADDRESS, ILLEGAL_FUNCTION, TARGET_SILENT
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from holdfast.discovery.device_search import Host, Unit
+
 
 class WriteInterrupted(ModbusError):
     """Ctrl-C has ended a write, which the device may carry out all the same, or its check."""
@@ -134,9 +136,10 @@ def hint_at_late_replies(longest: float, timeout: float) -> None:
     )
 
 
-def hint_at_silence(url: str) -> None:
-    """Says what may help if a device at a URL accepts connections and answers no unit id."""
-    if "pause_after_connect" not in url and not answers.wanted():
+def hint_at_silence(url: str, asked: Sequence[Unit | Host], longest_late: float) -> None:
+    """Says what may help if what was asked at a URL accepts connections and replies to nothing."""
+    is_mute = asked and not longest_late and all(each.is_mute for each in asked)
+    if is_mute and "pause_after_connect" not in url and not answers.wanted():
         click.echo(
             "hint: some devices ignore what comes in the first seconds after connecting: "
             f"'{url}{'&' if '?' in url else '?'}pause_after_connect=2' waits for them",

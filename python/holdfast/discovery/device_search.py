@@ -15,6 +15,7 @@ from time import sleep as pause
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from holdfast.client import Client
+from holdfast.client.url import NetworkTarget
 from holdfast.errors import (
     ConnectFailed,
     ConnectionLost,
@@ -74,6 +75,8 @@ class Host:
     identity: Identity = field(default_factory=Identity)
     longest_late: float = 0.0
     """How many seconds its slowest late reply took; 0 if there was none."""
+    is_mute: bool = False
+    """As of a unit id, see `Unit`."""
 
     @property
     def url(self) -> str:
@@ -92,6 +95,8 @@ class Unit:
     identity: Identity = Identity()
     is_garbled: bool = False
     """Whether bytes came that are not a valid reply: the settings of a line may be wrong."""
+    is_mute: bool = False
+    """Whether a connection was made and no reply came: it may have been asked too soon."""
 
 
 @dataclass
@@ -174,7 +179,10 @@ async def _host(address: str, port: int, timeout: float, units: Sequence[int]) -
 
 
 async def _ask(host: Host, client: Client, units: Sequence[int]) -> None:
-    """Asks unit ids until one answers, as `units`, and notes in `host` what was found."""
+    """Asks unit ids until one answers, and notes in `host` what was found.
+
+    The first is asked once more after the second, see `units`.
+    """
     for unit in (*units[:2], *units[:1], *units[2:]):
         try:
             await client.read("holding_registers", 0, "uint16", unit=unit)
@@ -191,6 +199,7 @@ async def _ask(host: Host, client: Client, units: Sequence[int]) -> None:
         except (RequestTimeout, ConnectionLost, InvalidResponse) as error:
             if isinstance(error, RequestTimeout) and not error.maybe_sent:
                 return  # No connection was made: the other unit ids would wait as long.
+            host.is_mute = isinstance(error, RequestTimeout)
             if host.state != "modbus":
                 host.state = "open"
                 host.detail = str(error)
@@ -212,21 +221,22 @@ def units(client: SyncClient, unit_ids: Sequence[int], *, delay: float = 0.0) ->
     """Asks unit ids one by one, and yields each. Raises `ConnectFailed`.
 
     If the first two do not reply, the first is asked once more: some devices ignore what comes soon
-    after connecting, and after three timeouts the connection is another one. It is yielded again
-    if it answers.
+    after connecting, and after three timeouts the connection is another one.
     """
-    is_silent = True
-    for count, unit in enumerate(unit_ids, 1):
-        if count > 1:
+    head: list[Unit] = []
+    for unit in unit_ids[:2]:
+        if head:
             pause(delay)
-        found = probe(client, unit, delay=delay)
-        is_silent = is_silent and not found.answers and not found.is_garbled
-        yield found
-        if is_silent and count == min(2, len(unit_ids)):
-            pause(delay)
-            found = probe(client, unit_ids[0], delay=delay)
-            if found.answers:
-                yield found
+        head.append(probe(client, unit, delay=delay))
+        if not head[-1].is_mute:
+            break
+    else:
+        pause(delay)
+        head[0] = probe(client, unit_ids[0], delay=delay)
+    yield from head
+    for unit in unit_ids[len(head) :]:
+        pause(delay)
+        yield probe(client, unit, delay=delay)
 
 
 def probe(client: SyncClient, unit: int, *, delay: float = 0.0) -> Unit:
@@ -241,9 +251,19 @@ def probe(client: SyncClient, unit: int, *, delay: float = 0.0) -> Unit:
     except ConnectFailed:
         raise
     except ModbusError as error:
-        is_garbled = isinstance(error, InvalidResponse)
-        return Unit(unit, answers=False, detail=str(error), is_garbled=is_garbled)
+        return Unit(
+            unit,
+            answers=False,
+            detail=str(error),
+            is_garbled=isinstance(error, InvalidResponse),
+            is_mute=_connects(client) and isinstance(error, RequestTimeout) and error.maybe_sent,
+        )
     return Unit(unit, answers=True, detail=detail, identity=_identify(client, unit, delay))
+
+
+def _connects(client: SyncClient) -> bool:
+    """Whether a client makes connections, which a serial line and UDP have none of."""
+    return isinstance(client.target, NetworkTarget) and "udp" not in client.target.transport
 
 
 def _identify(client: SyncClient, unit: int, delay: float) -> Identity:

@@ -60,8 +60,6 @@ _UNITS_HELP = (
 MAX_LINES = 60
 """The most lines of tags in the text; a file and JSON have all tags."""
 
-NO_UNIT = Ended("nothing", "no unit id answered")
-
 INFERENCE_S = 2
 """The time for what was found when a signal has ended the search."""
 
@@ -156,14 +154,12 @@ def describe(
         run = _Run(url, asked, settings, times, every, output, force, most, report)
         with device.connect(url, asked[0], timeout) as client:
             why = run.carry_out(client, is_line=is_line)
-            is_silent = why is NO_UNIT and not (is_line or run.is_garbled or client.longest_late)
         run.end(why)
     try:
         if why is not None:
             fail(f"{url}: {why}", is_printed=as_json)
     finally:
-        if is_silent:
-            device_errors.hint_at_silence(url)
+        device_errors.hint_at_silence(url, run.seen, client.longest_late)
 
 
 @dataclass
@@ -183,7 +179,7 @@ class _Run:
     report: Report
 
     def __post_init__(self) -> None:
-        self._by_unit: dict[int, Unit] = {}
+        self.seen: list[Unit] = []
         self._alike: list[Unit] = []
         self._found: list[Description] = []
         self._files: list[str] = []
@@ -191,21 +187,12 @@ class _Run:
         """The error of the first file that could not be written."""
 
     @property
-    def _seen(self) -> list[Unit]:
-        return list(self._by_unit.values())
-
-    @property
-    def is_garbled(self) -> bool:
-        """Whether a unit id sent invalid replies."""
-        return any(each.is_garbled for each in self._seen)
-
-    @property
     def _answering(self) -> list[Unit]:
-        return [each for each in self._seen if each.answers]
+        return [each for each in self.seen if each.answers]
 
     @property
     def _to_describe(self) -> list[Unit]:
-        return device_search.devices(self._seen, self._alike)
+        return device_search.devices(self.seen, self._alike)
 
     @property
     def _unread(self) -> Ended | None:
@@ -218,7 +205,7 @@ class _Run:
     def carry_out(self, client: SyncClient, *, is_line: bool) -> Ended | None:
         """Asks unit ids, and describes those that answer. Returns why it ended early, or `None`."""
         why = self._attempt(lambda: self._ask(client, is_line=is_line))
-        self.report.text(*units_lines(self.url, self.asked, self._seen, self._alike))
+        self.report.text(*units_lines(self.url, self.asked, self.seen, self._alike))
         if why is not None:
             return why
         for each in self._to_describe:
@@ -234,7 +221,7 @@ class _Run:
             return replace(why, detail=f"{why}; {unwritten}")
         if why is not None:
             return why
-        return unwritten if self._found else NO_UNIT
+        return unwritten if self._found else Ended("nothing", "no unit id answered")
 
     def end(self, why: Ended | None) -> None:
         """Prints what is known when the search has ended."""
@@ -244,7 +231,7 @@ class _Run:
         self.report.end(
             {
                 **ended_to_json(why),
-                **units_to_json(self.asked, self._seen, self._alike),
+                **units_to_json(self.asked, self.seen, self._alike),
                 "not_described": left,
                 "files": self._files,
                 "units": [unit_to_json(each) for each in self._found],
@@ -259,15 +246,15 @@ class _Run:
         with self.report.progress("Asking", len(asked), lambda: ""):
             for unit in device_search.units(client, asked, delay=delay):
                 with self.report.held():
-                    self._by_unit[unit.unit] = unit
-                    self.report.advance(len(self._seen))
+                    self.seen.append(unit)
+                    self.report.advance(len(self.seen))
                     if unit.answers:
                         self.report.text(f"Unit {unit.unit} answers.")
                         about = dict(unit.identity.objects)
                         self.report.entry({"unit": unit.unit, "identification": about})
-        if len(asked) == len(self._seen):
+        if len(asked) == len(self.seen):
             self._alike = device_search.like_unusual(
-                client, self._seen, is_line=is_line, delay=delay
+                client, self.seen, is_line=is_line, delay=delay
             )
 
     def _describe(self, unit: _UnitReport, client: SyncClient) -> None:

@@ -106,8 +106,9 @@ def find_hosts(
         click.echo("holdfast: interrupted", err=True)
     latest = max((host.longest_late for host in found), default=0.0)
     hint_at_late_replies(latest, timeout)
-    if listed and not latest and not interrupted and not counts["modbus"]:
-        hint_at_silence(listed[0].url)
+    mute = [host for host in listed if host.is_mute]
+    if mute and not interrupted and not counts["modbus"]:
+        hint_at_silence(mute[0].url, mute, latest)
     if interrupted or not counts["modbus"]:
         sys.exit(ExitCode.FAILED)
 
