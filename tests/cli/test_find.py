@@ -352,6 +352,8 @@ def test_unit_ids_so_far_are_shown_when_it_is_interrupted() -> None:
         terminal.process.send_signal(signal.SIGINT)
         assert terminal.end() == 1
     shown = plain(terminal.shown)
+    # The first one is asked twice if nothing answers.
+    assert "247 unit ids, at most 14880 s if none answers." in shown
     assert f"{host.url}: 2 unit ids of 2 asked answer" in shown
     assert "not asked: 3-247" in shown
     assert "interrupted" in shown

@@ -45,8 +45,9 @@ def find_units(
     if is_line:
         refuse_broadcast(unit_ids)
     if sys.stderr.isatty():
-        most = len(unit_ids) * (timeout + delay)
-        click.echo(f"{len(unit_ids)} unit ids, at most {most:.0f} s. Ctrl-C stops.", err=True)
+        most = (len(unit_ids) + 1) * (timeout + delay)  # The first is asked twice.
+        told = f"{len(unit_ids)} unit ids, at most {most:.0f} s if none answers. Ctrl-C stops."
+        click.echo(told, err=True)
     found: list[Unit] = []
     with interruptions() as signals:
         report = Report({"target": url}, signals)
