@@ -416,6 +416,7 @@ def test_sunspec_models_are_read_in_parts_if_they_must(
 def test_sunspec_tags_are_what_the_device_takes_at_once() -> None:
     models = [sunspec_device.common(), sunspec_device.inverter(), sunspec_device.mppt()]
     models[0][2:18] = sunspec_device.text("Acme Works of the North", 32)
+    models[0][18:34] = struct.unpack(">16H", "Onduleur 30 modèle 5".encode().ljust(32, b"\0"))
     content = sunspec_device.registers(*models)
 
     def answers(pdu: bytes) -> bytes:
@@ -435,6 +436,7 @@ def test_sunspec_tags_are_what_the_device_takes_at_once() -> None:
     values = {each.tag.name: each.values for each in found.tags}
     assert values["common_Mn_1"] + values["common_Mn_2"] == ("Acme Works of th", "e North")
     assert "mppt_module_2_DCA_raw" in values
+    assert not any(name.startswith("common_Md") for name in values)
 
 
 def test_an_interruption_costs_only_the_registers_at_hand(monkeypatch: pytest.MonkeyPatch) -> None:

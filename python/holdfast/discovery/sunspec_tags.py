@@ -42,21 +42,26 @@ def _factor(model: Model, point: Point, name: str, address: int) -> DescribedTag
 
 
 def _parts(point: Point, limit: int) -> Iterator[Point]:
-    """A point, in parts that the device returns in one request. Only texts have any."""
+    """A point, in parts that the device returns in one request. Only texts have any; one that would
+    be cut inside of a character has none.
+    """
     size = parsed(point.type).registers
     if point.encoding is None or size <= limit:
         yield point
         return
     content = point.value.encode(point.encoding)
-    # What follows the text is padding.
-    for number, first in enumerate(range(0, -(-len(content) // 2), limit), 1):
-        count = min(limit, size - first)
-        text = content[2 * first : 2 * (first + count)].decode(point.encoding, "replace")
+    starts = range(0, len(content), 2 * limit)  # What follows the text is padding.
+    try:
+        texts = [content[at : at + 2 * limit].decode(point.encoding) for at in starts]
+    except UnicodeDecodeError:
+        return
+    for number, text in enumerate(texts):
+        first = number * limit
         yield replace(
             point,
-            name=f"{point.name}_{number}",
+            name=f"{point.name}_{number + 1}",
             address=point.address + first,
-            type=f"string:{2 * count}",
+            type=f"string:{2 * min(limit, size - first)}",
             value=text,
         )
 
