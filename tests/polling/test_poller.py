@@ -475,6 +475,34 @@ def test_a_cancelled_wait_ends_neither_the_iteration_nor_loses_its_batch(
     asyncio.run(steps())
 
 
+def test_a_batch_that_failed_after_its_wait_was_cancelled_is_one_error(
+    device: holdfast.Server, poller: Poller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    has_begun, is_cancelled = threading.Event(), threading.Event()
+
+    def fail(polls: list[DevicePoll]) -> Batch:  # noqa: ARG001
+        has_begun.set()
+        is_cancelled.wait(wire.DEADLINE)
+        monkeypatch.undo()
+        raise MemoryError
+
+    monkeypatch.setattr(poller_module, "Batch", fail)
+    poller.add(url(device), {"x": ("coils", 3)}, interval=0.01)
+
+    async def steps() -> None:
+        waiting = asyncio.ensure_future(anext(aiter(poller)))
+        assert await asyncio.to_thread(has_begun.wait, wire.DEADLINE)
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+
+    asyncio.run(steps())
+    is_cancelled.set()
+    with pytest.raises(MemoryError):
+        poller.take(wire.DEADLINE)
+    assert len(taken(poller)) > 0
+
+
 def test_an_iteration_can_be_closed_and_another_goes_on(
     device: holdfast.Server, poller: Poller
 ) -> None:

@@ -266,7 +266,8 @@ class Poller:
             try:
                 batch = asked.result(timeout and min(timeout, MAX_TIMEOUT_S))
             except BaseException as error:
-                self._given_up.appendleft(asked)
+                if not (asked.done() and asked.exception()):
+                    self._given_up.appendleft(asked)
                 if isinstance(error, TimeoutError):
                     return None
                 raise
@@ -336,7 +337,7 @@ class Poller:
                 batch = await asyncio.wrap_future(asked)
             except (asyncio.CancelledError, GeneratorExit):
                 if not asked.cancel():  # It has begun.
-                    self._given_up.append(asked)
+                    self._given_up.appendleft(asked)
                 raise
             if batch is not None or self._has_ended:
                 return batch
