@@ -59,13 +59,9 @@ def as_real(value: Any) -> Any:
         return None
     if not value or not value.is_finite():
         return float(value)
-    exponent = value.adjusted()
-    if abs(exponent) > MAX_EXPONENT:  # Its fraction would fill the memory.
-        exponent = MAX_EXPONENT if exponent > 0 else -MAX_EXPONENT
-        value = decimal.Decimal((int(value.is_signed()), (1,), exponent))
-    # `ROUND_05UP` is to decimal digits what rounding to odd is to binary ones.
-    least, most = decimal.MIN_EMIN, decimal.MAX_EMAX
-    context = decimal.Context(MAX_DIGITS, decimal.ROUND_05UP, least, most, traps=[])
+    # `ROUND_05UP` is to decimal digits what rounding to odd is to binary ones. It makes neither
+    # 0 nor infinity of what is beyond the exponents, whose fraction would fill the memory.
+    context = decimal.Context(MAX_DIGITS, decimal.ROUND_05UP, -MAX_EXPONENT, MAX_EXPONENT, traps=[])
     return Fraction(context.plus(value))
 
 
