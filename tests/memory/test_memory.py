@@ -274,6 +274,7 @@ def test_a_bool_is_no_register(area: Area, memory: holdfast.Memory) -> None:
         b"\x01\x00",
         bytearray(b"\x01"),
         memoryview(b"\x01").cast("c"),
+        memoryview(bytes(8)).cast("H", [2, 2]),
         1,
         None,
         {1: 0},

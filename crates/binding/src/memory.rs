@@ -467,7 +467,8 @@ pub fn is_sequence(values: &Bound<'_, PyAny>) -> bool {
         || values.is_instance_of::<PyBytes>()
         || values.is_instance_of::<PyByteArray>();
     // The usual ones, at once: what follows takes longer than a write of one register.
-    if !is_text && values.cast::<PySequence>().is_ok() {
+    let may_have_rows = values.is_instance_of::<PyMemoryView>();
+    if !is_text && !may_have_rows && values.cast::<PySequence>().is_ok() {
         return true;
     }
     let is_unordered = values.is_instance_of::<PySet>()
