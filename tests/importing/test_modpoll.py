@@ -290,12 +290,33 @@ def test_addresses_that_no_poll_read_are_not_read(
     assert found.data["devices"]["plant"]["max_gap"] == gap
 
 
+def test_of_equal_names_in_a_device_the_last_one_has_the_value(
+    read: Callable[[str], Imported], tmp_path: Path
+) -> None:
+    found = read(
+        "device,plant,1\n"
+        "poll,coil,0,32,BE_BE\nref,power,0,bool,rw\nref,run,1,bool8,r\n"
+        "poll,holding_register,0,40,BE_BE\nref,power,30,uint16,r\nref,my power,31,uint16,r\n"
+        "poll,holding_register,20,20,BE_BE\nref,power,33,uint16,rw\nref,my_power,32,uint16,r\n"
+    )
+    run, numbers = [False] * 6 + [True] * 2, [1033, 1032]
+    assert values(tmp_path) == [*run, *numbers]
+    tags = found.data["devices"]["plant"]["tags"]
+    assert [name for name in tags if not name.startswith("run")] == ["power", "my_power"]
+    told = "left out: line {} has this name, too: the last counts, as in modpoll"
+    assert [each for each in notes(found) if "left out" in each] == [
+        f"3: plant.power: {told.format(9)}",
+        f"6: plant.power-2: {told.format(9)}",
+        f"7: plant.'my power': {told.format(10)}",
+    ]
+
+
 def test_names_are_unique(read: Callable[[str], Imported]) -> None:
-    rows = "poll,holding_register,0,10,BE_BE\nref,a b,0,int16,r\nref,a_b,1,int16,r\n"
+    rows = "poll,holding_register,0,10,BE_BE\nref,a#b,0,int16,r\nref,a_b,1,int16,r\n"
     found = read(f"device,plant,1,,\n{rows}device,plant,2,,\n{rows}device,1. Stock,3,,\n{rows}")
     devices = found.data["devices"]
     assert list(devices) == ["plant", "plant-2", "1._Stock"]
-    assert [list(each["tags"]) for each in devices.values()] == [["a_b", "a_b-2"]] * 3
+    assert [list(each["tags"]) for each in devices.values()] == [["a_b-2", "a_b"]] * 3
     assert [each["unit"] for each in devices.values()] == [1, 2, 3]
 
 

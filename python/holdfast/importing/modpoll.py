@@ -240,10 +240,24 @@ def _devices(desk: Desk, rows: _Rows) -> Iterator[_Device]:
     for device in made:
         for each in device.polls:
             device.tags += _bit_tags(desk, each) if each.is_of_bits else _tags(desk, each)
+        _leave_out_replaced(desk, device)
         if device.tags:
             yield device
         else:
             desk.left_out(device.path, "no reference of it is read")
+
+
+def _leave_out_replaced(desk: Desk, device: _Device) -> None:
+    """Leaves out the references whose name a later one has: the source had one value for it."""
+    references = [each for poll in device.polls for each in poll.references]
+    last = {each.name: each.path for each in references}
+    for each in references:
+        if (path := last[each.name]) != each.path:
+            line = desk.document.place(path, of_key=True).line
+            desk.withdraw(each.path)
+            message = f"line {line} has this name, too: the last counts, as in modpoll"
+            desk.left_out(each.path, message)
+    device.tags = [each for each in device.tags if each[0] in last.values()]
 
 
 def _integer(text: str) -> int | None:
