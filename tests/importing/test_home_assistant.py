@@ -1306,7 +1306,8 @@ def test_actions_in_other_files_and_entities_without_a_unit_are_to_be_checked(
         "sensors: [{name: a, address: 1}, {name: b, address: 2}, {name: c, slave: 1, address: 3}]"
     )
     assert [note.partition(": check: ")[2] for note in notes(found)][3:] == [
-        "neighbours are read together: remove a tag that the device never answers, or only with 04",
+        "neighbours are read together: remove a tag that the device never answers, or only with "
+        "04; set max_registers if it answers only short requests",
         "modbus.write_register or modbus.write_coil in automations and scripts stops, also in "
         "other files: publish to set topics instead, with writes: true in the output",
         "no slave: unit 1, as in newer versions; older ones asked 0 (and 1 more)",

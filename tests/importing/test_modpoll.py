@@ -290,6 +290,33 @@ def test_addresses_that_no_poll_read_are_not_read(
     assert found.data["devices"]["plant"]["max_gap"] == gap
 
 
+@pytest.mark.parametrize(
+    ("second", "limits"),
+    [
+        ("holding_register,8,20", {"max_registers": 20}),
+        ("holding_register,10,123", {"max_registers": 123}),
+        ("holding_register,11,20", {}),
+        ("holding_register,2,8", {}),
+        ("input_register,10,20", {}),
+        ("coil,20,40", {"max_bits": 40}),
+    ],
+    ids=["overlapping", "adjacent", "apart", "inside", "of another area", "bits"],
+)
+def test_requests_are_no_longer_than_those_of_the_source(
+    read: Callable[[str], Imported], second: str, limits: dict[str, int]
+) -> None:
+    """A device may answer longer ones with exception 04, or not at all."""
+    kind = "bool16" if "coil" in second else "uint16"
+    start = second.split(",")[1]
+    found = read(
+        "device,plant,1\npoll,coil,0,20,BE_BE\nref,a,0,bool,r\n"
+        "poll,holding_register,0,10,BE_BE\nref,b,9,uint16,r\n"
+        f"poll,{second},BE_BE\nref,c,{start},{kind},r\n"
+    )
+    device = found.data["devices"]["plant"]
+    assert {key: device[key] for key in ("max_registers", "max_bits") if key in device} == limits
+
+
 def test_of_equal_names_in_a_device_the_last_one_has_the_value(
     read: Callable[[str], Imported], tmp_path: Path
 ) -> None:

@@ -870,9 +870,37 @@ def test_keys_of_other_styles_are_ignored(imported: Callable[[str], Imported]) -
 def test_gaps_are_those_of_the_optimization(imported: Callable[[str], Imported]) -> None:
     insert = '    optimization = "max_insert"\n    optimization_max_register_fill = 20\n'
     text = REQUEST.replace('    byte_order = "MSW-LE"\n', f'    byte_order = "MSW-LE"\n{insert}')
-    assert imported(text).data["devices"]["line-1"]["max_gap"] == 20
+    last = '{ register="input", address=%d, name="ready"'
+    for address, gap in ((24, 23), (25, 0)):
+        far = changed("address=4,", f"address={address},", text)
+        assert imported(far).data["devices"]["line-1"]["max_gap"] == gap
     text = METRIC.replace("  timeout", '  optimization = "max_insert"\n  timeout')
-    assert device(imported(text))["max_gap"] == 50
+    for address, gap in ((60, 50), (61, 0)):
+        far = changed('{ address=20, name="ready"', last % address, text)
+        assert device(imported(far))["max_gap"] == gap
+
+
+def test_requests_are_no_longer_than_those_of_the_source(
+    imported: Callable[[str], Imported],
+) -> None:
+    """A device may answer longer ones with exception 04, or not at all."""
+    more = """\
+  [[inputs.modbus.request]]
+    slave_id = 1
+    fields = [ { address=%d, name="a", type="INT64" }, { address=%d, name="b", type="INT16" } ]
+"""
+    line = imported(REQUEST + more % (6, 10)).data["devices"]["line-1"]
+    assert (line["max_registers"], line["max_gap"], "max_bits" in line) == (6, 3, False)
+    for apart in (more % (7, 11), more % (66, 70)):
+        line = imported(REQUEST + apart).data["devices"]["line-1"]
+        assert "max_registers" not in line, "the source joined all that follows another"
+    fields = ",".join(f'{{address={each}, name="a{each}", type="INT16"}}' for each in range(6, 260))
+    long = f"  [[inputs.modbus.request]]\n    slave_id = 1\n    fields = [{fields}]\n"
+    assert "max_registers" not in imported(REQUEST + long).data["devices"]["line-1"]
+    given = "  [inputs.modbus.workarounds]\n    max_word_registers_per_request = 20\n"
+    line = imported(REQUEST + more % (6, 10) + given).data["devices"]["line-1"]
+    assert line["max_registers"] == 20
+    assert "max_registers" not in device(imported(changed("address=20,", "address=10,", METRIC)))
 
 
 def test_a_single_table_is_an_input_too(imported: Callable[[str], Imported]) -> None:

@@ -10,7 +10,6 @@ import csv
 import io
 import math
 from dataclasses import dataclass, field
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.importing.imported import Imported, NotImportable
 from holdfast.importing.names import free_name, unique_names
 from holdfast.importing.notes import Desk
+from holdfast.importing.source_requests import read_settings
 from holdfast.protocol import ADDRESSES, MAX_UNIT, WRITE_LIMITS
 from holdfast.types import AREAS, REGISTER_AREAS, Area
 from holdfast.values import register_count
@@ -66,15 +66,9 @@ def read_modpoll(path: Path | str, url: str, interval_s: float = INTERVAL_S) -> 
     if not found and not desk.report.problems:
         desk.problem((), "no device with a reference that is read, allowed: at least one")
     names = unique_names(desk, [(each.path, str(each.path[0])) for each in found])
+    timing = {"interval": interval_s, "timeout": _TIMEOUT_S}
     devices = {
-        name: {
-            "url": url,
-            "unit": each.unit,
-            "interval": interval_s,
-            "timeout": _TIMEOUT_S,
-            "max_gap": each.max_gap(),
-            "tags": each.named_tags(desk),
-        }
+        name: {"url": url, "unit": each.unit, **timing, **each.settings(desk)}
         for name, each in zip(names, found, strict=True)
     }
     if desk.report.problems:
@@ -165,40 +159,12 @@ class _Device:
     polls: list[_Poll] = field(default_factory=list)
     tags: list[tuple[KeyPath, str, dict[str, Any]]] = field(default_factory=list)
 
-    def named_tags(self, desk: Desk) -> dict[str, dict[str, Any]]:
-        """The tags by name."""
+    def settings(self, desk: Desk) -> dict[str, Any]:
+        """The tags by name, and how they are read."""
         names = unique_names(desk, [(path, name) for path, name, _ in self.tags])
-        return {name: tag for name, (_, _, tag) in zip(names, self.tags, strict=True)}
-
-    def max_gap(self) -> int:
-        """Reads what a poll read at once, but no address that none of them read."""
-        inside, between = 0, ADDRESSES
-        for area in AREAS:
-            polls = sorted((poll.start, poll.end) for poll in self.polls if poll.area == area)
-            reach = polls[0][1] if polls else 0
-            for start, end in polls:
-                if start > reach:
-                    between = min(between, start - reach)
-                reach = max(reach, end)
-            used = sorted(
-                (tag["address"], tag["address"] + _count(tag["type"]))
-                for _, _, tag in self.tags
-                if tag["area"] == area
-            )
-            gaps = (
-                after - before
-                for (_, before), (after, _) in pairwise(used)
-                if any(start <= before and after < end for start, end in polls)
-            )
-            inside = max(inside, *gaps, 0)
-        return min(inside, between - 1)
-
-
-def _count(type_: str) -> int:
-    """The registers or bits of a tag."""
-    if type_.startswith("string:"):
-        return int(type_[len("string:") :]) // 2
-    return _WIDTHS.get(type_, 1)
+        tags = {name: tag for name, (_, _, tag) in zip(names, self.tags, strict=True)}
+        requests = [(each.area, range(each.start, each.end)) for each in self.polls]
+        return {**read_settings(requests, tags.values()), "tags": tags}
 
 
 def _devices(desk: Desk, rows: _Rows) -> Iterator[_Device]:

@@ -224,8 +224,8 @@ def _to_check(desk: Desk, path: KeyPath) -> None:
     desk.check(path, f"{moved} and their history")
     digits = "the source had 2 digits of floats, none of integers"
     desk.check(path, f"values are not rounded; {digits}")
-    advice = "remove a tag that the device never answers, or only with 04"
-    desk.check(path, f"neighbours are read together: {advice}")
+    advice = "remove a tag that the device never answers, or only with 04; set max_registers if it"
+    desk.check(path, f"neighbours are read together: {advice} answers only short requests")
 
 
 @dataclass

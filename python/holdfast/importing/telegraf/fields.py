@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.importing.names import unique_names
+from holdfast.importing.source_requests import Request, joined, read_settings
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT
 from holdfast.runtime.text import listing
 from holdfast.tags.read_gap import DEFAULT_MAX_GAP
@@ -18,7 +19,7 @@ from holdfast.values.digits import FLOATS
 from holdfast.values.numeric import INTEGERS, limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
     from holdfast.config.text.yaml_document import KeyPath
     from holdfast.importing.key_reader import Section
@@ -114,15 +115,27 @@ class Unit:
     """The fields of one unit id of an input."""
 
     fields: list[Field] = field(default_factory=list)
-    max_gap: int = 0
+    requests: list[Request] = field(default_factory=list)
+    """What each request of the source reads."""
+    reads: dict[Area, list[range]] = field(default_factory=dict)
+    """What fields read that are in no request yet."""
 
-    def tags(self, desk: Desk) -> dict[str, dict[str, Any]]:
-        """The tags, by name; a renamed one has the name of its field as description."""
+    def join(self, max_gap: int = 0) -> None:
+        """Makes requests of what fields read."""
+        for area, ranges in self.reads.items():
+            self.requests += [(area, each) for each in joined(ranges, max_gap)]
+        self.reads = {}
+
+    def settings(self, desk: Desk, limits: Mapping[str, int]) -> dict[str, Any]:
+        """How the fields are read, and the tags by name; a renamed one has the name of its field
+        as description. `limits` are those that the source names.
+        """
         names = unique_names(desk, [(each.path, each.name) for each in self.fields])
-        return {
+        tags = {
             name: each.tag if name == each.name else {**each.tag, "description": each.name}
             for name, each in zip(names, self.fields, strict=True)
         }
+        return {**read_settings(self.requests, tags.values()), **limits, "tags": tags}
 
 
 @dataclass
@@ -145,7 +158,9 @@ class Fields:
         else:
             gap = self._gap(self.source, MAX_INSERT_FILL)
             for metric in self.source.sections("metric", required=True):
-                self._metric(metric, gap)
+                self._metric(metric)
+            for unit in self.units.values():
+                unit.join(gap)
         self._note_bits()
         return style
 
@@ -165,6 +180,7 @@ class Fields:
         for area in _AREAS.values():
             for entry in self.source.sections(area):
                 self._register(unit, entry, area)
+        unit.join()
 
     def _register(self, unit: Unit, entry: Section, area: Area) -> None:
         name = entry.name("name", required=True)
@@ -248,22 +264,19 @@ class Fields:
         unit = self._unit(request)
         area = _AREAS[word(request, "register", tuple(_AREAS)) or "holding"]
         order = _ORDERS[word(request, "byte_order", tuple(_ORDERS)) or "ABCD"]
-        omitted = []
         for entry in self._entries(request):
             if entry.flag("omit"):
-                omitted.append(self._omitted(entry, area))
+                unit.reads.setdefault(area, []).append(self._omitted(entry, area))
             else:
                 self._field(unit, entry, area, order, [entry, request])
-        gap = self._gap(request, None)
-        unit.max_gap = max(unit.max_gap, gap, _longest(omitted))
+        unit.join(self._gap(request, None))
         request.text("measurement")
         self._leave_out_tags(request)
         request.close()
 
-    def _metric(self, metric: Section, gap: int) -> None:
+    def _metric(self, metric: Section) -> None:
         """The style `metric`: fields of any area."""
         unit = self._unit(metric)
-        unit.max_gap = gap
         order = _ORDERS[word(metric, "byte_order", tuple(_ORDERS)) or "ABCD"]
         for entry in self._entries(metric):
             area = _AREAS[word(entry, "register", tuple(_AREAS)) or "holding"]
@@ -412,6 +425,8 @@ class Fields:
     ) -> None:
         """Adds a tag, and notes its measurement."""
         named = [(each.at("measurement"), each.text("measurement")) for each in measured]
+        if addresses is not None:
+            unit.reads.setdefault(area, []).append(addresses)
         if name is None or addresses is None or found is None:
             return
         if addresses.stop > ADDRESSES:
@@ -435,13 +450,3 @@ def _order(order: str) -> dict[str, str]:
 def word(section: Section, key: str, allowed: tuple[str, ...]) -> str | None:
     """The word at a key. Empty text counts as absent in the source."""
     return None if section.get(key) == "" else section.word(key, allowed)
-
-
-def _longest(ranges: list[range]) -> int:
-    """The length of the longest stretch of addresses without a gap."""
-    longest = length = 0
-    end = -1
-    for each in sorted(ranges, key=lambda each: each.start):
-        length = length + len(each) if each.start == end else len(each)
-        longest, end = max(longest, length), each.stop
-    return longest

@@ -96,7 +96,7 @@ class InputReader:
             data: dict[str, Any] = {"url": url, "unit": number, **timing}
             if self.tolerance:
                 data["tolerance"] = dict(self.tolerance)
-            data |= {"max_gap": unit.max_gap, **self.limits, "tags": unit.tags(one.desk)}
+            data |= unit.settings(one.desk, self.limits)
             made.append(Device(one.at("name"), name, number, data, unit.fields))
         return made
 
