@@ -815,10 +815,15 @@ def test_measurements(imported: Callable[[str], Imported]) -> None:
     found = imported(prefixed + OUTPUT)
     assert found.data["outputs"]["influx"]["measurement"] == "plant_grid"
     found = imported(metric + REGISTER + OUTPUT)
-    assert "measurement" not in found.data["outputs"]["influx"]
+    first, second = found.data["outputs"].values()
+    assert (first["measurement"], first["devices"]) == ("grid", ["meter"])
+    assert ("measurement" in second, second["devices"]) == (False, ["press"])
+    assert {**first, "measurement": "", "devices": []} == {
+        **second,
+        "measurement": "",
+        "devices": [],
+    }
     place = "7: inputs.modbus[0].metric[0].measurement"
-    several = "an output has one measurement; add outputs with devices for several"
-    assert f"{place}: left out: {several}" in notes(found)
     found = imported(metric.replace("grid", "#1") + OUTPUT)
     assert "measurement" not in found.data["outputs"]["influx"]
     form = "a measurement is text that does not begin with #, without control characters, and "
@@ -826,6 +831,69 @@ def test_measurements(imported: Callable[[str], Imported]) -> None:
     assert f"{place}: left out: {form}" in notes(found)
     none = "no output is converted; see measurement of outputs"
     assert f"{place}: left out: {none}" in notes(imported(metric))
+
+
+SERIES = """\
+[[inputs.modbus]]
+  name = "meter"
+  controller = "tcp://10.0.0.5:502"
+  timeout = "1s"
+  configuration_type = "metric"
+  [[inputs.modbus.metric]]
+    measurement = "power"
+    fields = [
+      { address=0, name="voltage", type="INT16" }, { address=3, name="current", type="INT16" },
+    ]
+    tags = { phase = "L1" }
+  [[inputs.modbus.metric]]
+    measurement = "power"
+    fields = [
+      { address=1, name="voltage", type="INT16" }, { address=4, name="current", type="INT16" },
+    ]
+    tags = { phase = "L2" }
+  [[inputs.modbus.metric]]
+    measurement = "energy"
+    fields = [{ address=2, name="total", type="INT16" }]
+"""
+
+
+def test_fields_with_other_tags_or_measurements_are_a_device_of_their_own(
+    imported: Callable[[str], Imported],
+) -> None:
+    """An output has one measurement, and the same tags for all of its devices."""
+    found = imported(SERIES + OUTPUT)
+    read = {
+        name: {key: tag["address"] for key, tag in each["tags"].items()}
+        for name, each in found.data["devices"].items()
+    }
+    assert read == {
+        "meter-power-L1": {"voltage": 0, "current": 3},
+        "meter-power-L2": {"voltage": 1, "current": 4},
+        "meter-energy": {"total": 2},
+    }
+    gaps = [each["max_gap"] for each in found.data["devices"].values()]
+    assert gaps == [2, 2, 0], "what was one request is one for each device"
+    outputs = found.data["outputs"].values()
+    assert {each["measurement"]: each["devices"] for each in outputs} == {
+        "power": ["meter-power-L1", "meter-power-L2"],
+        "energy": ["meter-energy"],
+    }
+    message = "left out: add an output with these tags, and list {} in its devices"
+    assert [each for each in notes(found) if "these tags" in each] == [
+        f"11: inputs.modbus[0].metric[0].tags: {message.format('meter-power-L1')}",
+        f"17: inputs.modbus[0].metric[1].tags: {message.format('meter-power-L2')}",
+    ]
+
+
+def test_tags_that_all_fields_of_a_unit_have_are_in_no_name(
+    imported: Callable[[str], Imported],
+) -> None:
+    text = SERIES.partition('  [[inputs.modbus.metric]]\n    measurement = "energy"')[0]
+    for phase in ("L1", "L2"):
+        text = changed(f'phase = "{phase}"', f'phase = "{phase}", site = "north"', text)
+    assert list(imported(text).data["devices"]) == ["meter-L1", "meter-L2"]
+    only = text.rpartition("  [[inputs.modbus.metric]]\n")[0]
+    assert list(imported(only).data["devices"]) == ["meter"]
 
 
 def test_nothing_is_dropped_silently(imported: Callable[[str], Imported]) -> None:

@@ -1,11 +1,12 @@
 """Imports the Modbus inputs of Telegraf: their fields become tags of devices.
 
-An input becomes one device for each unit id that it reads. `outputs.influxdb_v2` becomes an
-output; tokens stay in the source.
+An input becomes one device for each unit id, measurement and set of tags. `outputs.influxdb_v2`
+becomes an output for each measurement; tokens stay in the source.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -109,7 +110,7 @@ def _texts(path: KeyPath, value: Any) -> Iterator[tuple[KeyPath, str]]:
     elif isinstance(value, dict | list):
         inside = value.items() if isinstance(value, dict) else enumerate(value)
         for key, each in inside:
-            # Tags of an input or of a part of it are not converted.
+            # Tags of an input or of its parts are only used for names of devices.
             if key != "tags" or path[0] != "inputs":
                 yield from _texts((*path, key), each)
 
@@ -145,7 +146,7 @@ class _Import:
             self.desk.problem(("inputs",), message)
         share_connections(self.desk, self.found)
         devices = self._named()
-        outputs = self._outputs()
+        outputs = self._outputs(list(devices))
         self.root.close(
             dict.fromkeys(("processors", "aggregators"), "values are published as they are read")
             | {"secretstores": "secrets are in files; see token_file and password_file"}
@@ -165,33 +166,59 @@ class _Import:
         return [each for each in made if each is not None]
 
     def _named(self) -> dict[str, dict[str, Any]]:
-        """The devices by name: that of the input, with the unit id if another has the same."""
-        names = [each.name for each in self.found]
-        wanted = [
-            (each.path, each.name if names.count(each.name) == 1 else f"{each.name}-{each.unit}")
-            for each in self.found
-        ]
-        unique = unique_names(self.desk, wanted)
-        return {name: each.data for name, each in zip(unique, self.found, strict=True)}
+        """The devices by name: that of the input, with the unit id if another has the same, and
+        with what tells devices of one unit apart.
+        """
+        units = {(each.name, each.path, each.unit) for each in self.found}
+        of_name = Counter(name for name, _, _ in units)
+        wanted = []
+        for each in self.found:
+            numbered = [str(each.unit)] if of_name[each.name] > 1 else []
+            series = [each.series] if each.series else []
+            wanted.append((each.path, "-".join([each.name, *numbered, *series])))
+        names = unique_names(self.desk, wanted)
+        for name, each in zip(names, self.found, strict=True):
+            for path in {at: None for one in each.fields if (at := one.tagged_at) is not None}:
+                message = f"add an output with these tags, and list {name} in its devices"
+                self.desk.left_out(path, message)
+        return {name: each.data for name, each in zip(names, self.found, strict=True)}
 
-    def _outputs(self) -> dict[str, dict[str, Any]]:
+    def _outputs(self, names: list[str]) -> dict[str, dict[str, Any]]:
         reason = "no output is like it; there are influx, mqtt, sparkplug, file and nats"
         sections = self._sections("outputs", "influxdb_v2", reason)
         tags = self.root.mapping("global_tags")
         fields = [each for device in self.found for each in device.fields]
-        measurement = _measurement(self.desk, fields) if sections else MEASUREMENT
+        measured = self._by_measurement(names) if sections else {}
         outputs: dict[str, dict[str, Any]] = {}
         for one in sections:
             made = Influx(one).read()
             if made is None:
                 continue
-            made |= {"measurement": measurement} if measurement != MEASUREMENT else {}
             made |= {"tags": found} if (found := self._global_tags(tags)) else {}
-            outputs[free_name("influx", set(outputs))] = made
+            for measurement, devices in measured.items():
+                output = dict(made)
+                if measurement != MEASUREMENT:
+                    output["measurement"] = measurement
+                if len(measured) > 1:
+                    output["devices"] = devices
+                outputs[free_name("influx", set(outputs))] = output
             self._compare(one, fields)
         if not outputs:
             self._without_output(tags, fields)
         return outputs
+
+    def _by_measurement(self, names: list[str]) -> dict[str, list[str]]:
+        """The devices of each measurement, by name."""
+        found: dict[str, list[str]] = {}
+        for name, device in zip(names, self.found, strict=True):
+            one = device.fields[0]
+            measurement = one.measurement
+            if not is_measurement(measurement):
+                message = f"a measurement is {MEASUREMENT_FORM}"
+                self.desk.left_out(one.measured_at or one.path, message)
+                measurement = MEASUREMENT
+            found.setdefault(measurement, []).append(name)
+        return found
 
     def _without_output(self, tags: Section | None, fields: list[Field]) -> None:
         if tags is not None and tags.data:
@@ -231,20 +258,3 @@ class _Import:
             message += "whole numbers integers, those of uint64 floats)"
             advice = "InfluxDB refuses them in the same measurement of a bucket: use another bucket"
             self.desk.check(output.path, f"{message}; {advice}")
-
-
-def _measurement(desk: Desk, fields: list[Field]) -> str:
-    """The measurement of all fields; if they have several, notes that the output has one."""
-    all_of_them = {each.measurement for each in fields}
-    if len(all_of_them) == 1:
-        [found] = all_of_them
-        if is_measurement(found):
-            return found
-        first = fields[0]
-        desk.left_out(first.measured_at or first.path, f"a measurement is {MEASUREMENT_FORM}")
-        return MEASUREMENT
-    for each in fields:
-        if each.measured_at is not None:
-            message = "an output has one measurement; add outputs with devices for several"
-            desk.left_out(each.measured_at, message)
-    return MEASUREMENT

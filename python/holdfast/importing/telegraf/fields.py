@@ -1,4 +1,4 @@
-"""What fields of Telegraf's `inputs.modbus` become: tags, by unit id.
+"""What fields of Telegraf's `inputs.modbus` become: tags of devices.
 
 Telegraf has three styles of configuration: `register`, `request` and `metric`.
 """
@@ -108,6 +108,10 @@ class Field:
     measurement: str = MEASUREMENT
     measured_at: KeyPath | None = None
     """Where the measurement is named; `None` for the default."""
+    point_tags: tuple[tuple[str, str], ...] = ()
+    """The tags that its points have in the source, sorted by name."""
+    tagged_at: KeyPath | None = None
+    """Where these are; `None` if there are none."""
 
 
 @dataclass
@@ -126,14 +130,30 @@ class Unit:
             self.requests += [(area, each) for each in joined(ranges, max_gap)]
         self.reads = {}
 
-    def settings(self, desk: Desk, limits: Mapping[str, int]) -> dict[str, Any]:
-        """How the fields are read, and the tags by name; a renamed one has the name of its field
-        as description. `limits` are those that the source names.
+    def series(self) -> list[tuple[str, list[Field]]]:
+        """The fields of each measurement and set of tags, with what tells these sets apart."""
+        found: dict[tuple[str, tuple[tuple[str, str], ...]], list[Field]] = {}
+        for each in self.fields:
+            found.setdefault((each.measurement, each.point_tags), []).append(each)
+        measurements = {measurement for measurement, _ in found}
+        shared = set.intersection(*(set(tags) for _, tags in found))
+        made: list[tuple[str, list[Field]]] = []
+        for (measurement, tags), fields in found.items():
+            words = [measurement] if len(measurements) > 1 else []
+            words += [value for name, value in tags if (name, value) not in shared]
+            made.append(("-".join(words), fields))
+        return made
+
+    def settings(
+        self, desk: Desk, fields: list[Field], limits: Mapping[str, int]
+    ) -> dict[str, Any]:
+        """How these fields are read, and their tags by name; a renamed one has the name of its
+        field as description. `limits` are those that the source names.
         """
-        names = unique_names(desk, [(each.path, each.name) for each in self.fields])
+        names = unique_names(desk, [(each.path, each.name) for each in fields])
         tags = {
             name: each.tag if name == each.name else {**each.tag, "description": each.name}
-            for name, each in zip(names, self.fields, strict=True)
+            for name, each in zip(names, fields, strict=True)
         }
         return {**read_settings(self.requests, tags.values()), **limits, "tags": tags}
 
@@ -262,6 +282,7 @@ class Fields:
     def _request(self, request: Section) -> None:
         """The style `request`: fields of one area."""
         unit = self._unit(request)
+        known = len(unit.fields)
         area = _AREAS[word(request, "register", tuple(_AREAS)) or "holding"]
         order = _ORDERS[word(request, "byte_order", tuple(_ORDERS)) or "ABCD"]
         for entry in self._entries(request):
@@ -271,18 +292,19 @@ class Fields:
                 self._field(unit, entry, area, order, [entry, request])
         unit.join(self._gap(request, None))
         request.text("measurement")
-        self._leave_out_tags(request)
+        self._tag(request, unit.fields[known:])
         request.close()
 
     def _metric(self, metric: Section) -> None:
         """The style `metric`: fields of any area."""
         unit = self._unit(metric)
+        known = len(unit.fields)
         order = _ORDERS[word(metric, "byte_order", tuple(_ORDERS)) or "ABCD"]
         for entry in self._entries(metric):
             area = _AREAS[word(entry, "register", tuple(_AREAS)) or "holding"]
             self._field(unit, entry, area, order, [metric])
         metric.text("measurement")
-        self._leave_out_tags(metric)
+        self._tag(metric, unit.fields[known:])
         metric.close()
 
     def _entries(self, section: Section) -> list[Section]:
@@ -290,10 +312,13 @@ class Fields:
             section.problem("fields", "no field, allowed: at least one")
         return section.sections("fields", required=True)
 
-    def _leave_out_tags(self, section: Section) -> None:
-        if section.get("tags"):
-            message = "add an output with these tags, and list this device in its devices"
-            section.left_out("tags", message)
+    def _tag(self, section: Section, fields: list[Field]) -> None:
+        """Gives fields the tags of their request or metric."""
+        table = section.mapping("tags")
+        given = table.data.items() if table is not None else ()
+        if tags := tuple(sorted((name, str(value)) for name, value in given if value)):
+            for each in fields:
+                each.point_tags, each.tagged_at = tags, section.at("tags")
 
     def _gap(self, section: Section, default: int | None) -> int:
         """The largest gap that the source read to join two fields."""

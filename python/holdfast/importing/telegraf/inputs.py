@@ -1,4 +1,8 @@
-"""Imports the Modbus inputs of Telegraf: each becomes one device for each unit id that it reads."""
+"""Imports the Modbus inputs of Telegraf: each becomes one device for each unit id that it reads.
+
+Fields with other tags, or of another measurement, are a device of their own: an output has one set
+of tags, and one measurement, for its devices.
+"""
 
 from __future__ import annotations
 
@@ -59,8 +63,11 @@ class Device:
     path: KeyPath
     name: str
     unit: int
+    series: str
+    """What tells it apart from others of this unit."""
     data: dict[str, Any]
     fields: list[Field]
+    """At least one; all have the same measurement and tags."""
 
 
 @dataclass
@@ -74,7 +81,7 @@ class InputReader:
     limits: dict[str, int] = field(default_factory=dict)
 
     def devices(self) -> list[Device]:
-        """A device for each unit id with a tag."""
+        """The devices that have tags."""
         one = self.input
         name = one.name("name", required=True) or "device"
         url = self._url()
@@ -93,11 +100,12 @@ class InputReader:
                 continue
             if url is not None and url.startswith(("rtu:", "ascii:")):
                 self._check_serial_unit(number)
-            data: dict[str, Any] = {"url": url, "unit": number, **timing}
-            if self.tolerance:
-                data["tolerance"] = dict(self.tolerance)
-            data |= unit.settings(one.desk, self.limits)
-            made.append(Device(one.at("name"), name, number, data, unit.fields))
+            for series, its_fields in unit.series():
+                data: dict[str, Any] = {"url": url, "unit": number, **timing}
+                if self.tolerance:
+                    data["tolerance"] = dict(self.tolerance)
+                data |= unit.settings(one.desk, its_fields, self.limits)
+                made.append(Device(one.at("name"), name, number, series, data, its_fields))
         return made
 
     def _check_serial_unit(self, number: int) -> None:
