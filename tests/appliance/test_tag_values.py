@@ -374,11 +374,12 @@ def test_polls_of_the_machine_before_a_reload_are_not_of_the_new_one(
     made["outputs"]["out"]["publish"] = "change"
     found = TagValues(cast("Any", Polls()))
     before = adopt(found, load(saved(tmp_path, made)))["m"]
+    assert (found.answering(), found.answers) == ({"m": False}, 1)
     found._handle(deque([(before, 0.0, registers(10))]))
-    assert (power(found), found.answering(), found.answers) == ([1.0], {"m": True}, 1)
+    assert (power(found), found.answering(), found.answers) == ([1.0], {"m": True}, 2)
     made["devices"]["m"] |= change
     now = adopt(found, load(saved(tmp_path, made)))["m"]
-    assert (found.latest(), found.answering(), found.answers) == ([], {"m": False}, 2)
+    assert (found.latest(), found.answering(), found.answers) == ([], {"m": False}, 3)
     buffer = found._outputs["out"].buffer
     waiting = len(buffer)
     # The first poll of the new machine may come before the late one.
@@ -386,7 +387,7 @@ def test_polls_of_the_machine_before_a_reload_are_not_of_the_new_one(
         found._handle(deque([(reported_as, 0.0, registers(value))]))
     assert power(found) == [1.0]
     assert len(buffer) == waiting + 4, "the same values, of another machine"
-    assert (found.answering(), found.answers) == ({"m": True}, 3)
+    assert (found.answering(), found.answers) == ({"m": True}, 4)
 
 
 def test_a_poll_under_way_counts_if_a_reload_changes_only_other_settings(tmp_path: Path) -> None:

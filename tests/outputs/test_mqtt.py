@@ -95,6 +95,22 @@ def test_a_device_that_does_not_answer_is_offline(plant: Plant) -> None:
         probe.until("plant/pump/temperature", "10.0")
 
 
+def test_a_device_is_offline_from_a_start_until_it_answers(plant: Plant) -> None:
+    """The broker has kept `online` and the values of the run before."""
+    device = plant.slow_device()
+    probe = plant.probe("plant/holdfast/#")
+    plant.run()
+    probe.until("plant/holdfast/status/pump", "online")
+    plant.stop()
+    probe.until("plant/holdfast/status", "offline")
+    device.hold()
+    plant.run()
+    seen = probe.until("plant/holdfast/status", "online")
+    assert texts(seen, "plant/holdfast/status/pump") == ["offline"]
+    device.go_on()
+    probe.until("plant/holdfast/status/pump", "online")
+
+
 def test_a_device_that_a_reload_moves_is_offline_until_it_answers(plant: Plant) -> None:
     plant.device().set(100)
     probe = plant.probe("plant/#")

@@ -59,7 +59,7 @@ class Site(Protocol):
         """What is known of each device."""
 
     def answering(self) -> Mapping[str, bool]:
-        """Whether each device answers, as far as it is known."""
+        """Whether each device answers: none does before its first poll."""
 
     @property
     def standby(self) -> Set[str]:

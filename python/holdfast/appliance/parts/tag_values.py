@@ -226,13 +226,12 @@ class TagValues:
             }
             began = {name: at for name, at in self.tagged_since.items() if name not in changed}
             self.tagged_since = dict.fromkeys(tagged, time.time()) | began
-            # Nobody knows yet whether the other machine answers.
-            self.answers += bool(moved)
-            self._answering = {
-                name: answers and name not in moved
-                for name, answers in self._answering.items()
-                if name in tagged
+            # Nobody knows yet whether a new device answers, or another machine.
+            answering = {
+                name: self._answering.get(name, False) and name not in moved for name in tagged
             }
+            self.answers += answering != self._answering
+            self._answering = answering
             self.standby &= tagged.keys()
             self._readers = {each.reported_as: each.reader for each in tagged.values()}
             self._latest = {
@@ -312,7 +311,7 @@ class TagValues:
         return {name: device.reader.tags for name, device in tagged.items()}
 
     def answering(self) -> dict[str, bool]:
-        """Whether each device answers, as far as it is known. Thread-safe."""
+        """Whether each device answers: none does before its first poll. Thread-safe."""
         with self._lock:
             return dict(self._answering)
 
@@ -386,7 +385,7 @@ class TagValues:
             if poll.is_standby is not (poll.device in self.standby):
                 self.standby ^= {poll.device}
             answers = poll.has_answered
-            if self._answering.get(poll.device) is not answers:
+            if self._answering[poll.device] is not answers:
                 self._answering[poll.device] = answers
                 self.answers += 1
         for output in self._outputs.values():

@@ -30,8 +30,8 @@ class Availability:
         """Of each device, whether it answered when that was published last."""
         self._answers = -1
         """The number of answers of the site at which all was published."""
-        self._is_denied = threading.Event()
-        """Set if somebody else has published that this output is not online."""
+        self._is_due = threading.Event()
+        """Set until `ONLINE` of the output is published, for the first time or again."""
         self._repeated_at = -inf
 
     def of_output(self, payload: bytes) -> Message:
@@ -44,20 +44,22 @@ class Availability:
         Another output with this topic may have published it, or a late will of this output.
         """
         if payload != ONLINE:
-            self._is_denied.set()
+            self._is_due.set()
 
-    def repeated(self) -> Message | None:
-        """`ONLINE` again, if somebody else has published that the output is not."""
+    def online(self) -> Message | None:
+        """`ONLINE` of the output: at first, and if somebody else has published that it is not."""
         now = time.monotonic()
-        if not self._is_denied.is_set() or now < self._repeated_at + MIN_REPEAT_INTERVAL_S:
+        if not self._is_due.is_set() or now < self._repeated_at + MIN_REPEAT_INTERVAL_S:
             return None
-        self._is_denied.clear()
+        self._is_due.clear()
         self._repeated_at = now
         return self.of_output(ONLINE)
 
     def begin(self) -> None:
         """Forgets what was published: a broker may have lost it."""
         self._answering, self._answers = {}, -1
+        self._repeated_at = -inf
+        self._is_due.set()
 
     def keep(self, devices: Set[str]) -> None:
         """Forgets all other devices."""

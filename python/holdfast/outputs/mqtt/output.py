@@ -118,7 +118,6 @@ class MqttOutput(BrokerReceiver):
         # Some brokers end the connection of a program that may only publish.
         if self._settings.writes or self._discovery is not None:
             session.subscribe([self._topics.status], retained=False)
-        session.publish([self._availability.of_output(ONLINE)])
         # A broker that ends each connection at once must not fill the buffer with repetitions.
         if self._connects > 1 and self._has_sent:
             self._has_sent = False
@@ -126,8 +125,6 @@ class MqttOutput(BrokerReceiver):
 
     def _keep_up(self, session: Session) -> None:
         """Publishes what has to be known before values."""
-        if repeated := self._availability.repeated():
-            session.publish([repeated])
         self._forget_removed()
         revision = self._site.revision
         if revision != self._revision:
@@ -138,7 +135,10 @@ class MqttOutput(BrokerReceiver):
                 self._is_born.clear()
                 self._publish(session, self._entities)
             self._remove_stale(session)
+        # In this order: the broker may have kept that a device answers from the run before.
         self._publish_availability(session, answering=False)
+        if online := self._availability.online():
+            session.publish([online])
 
     def _adopt(self, session: Session, tags: Mapping[str, Sequence[Tag]]) -> None:
         """Takes over the tags: of the first configuration, and after each reload."""
