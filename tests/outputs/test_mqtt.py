@@ -271,7 +271,35 @@ def test_a_refused_message_is_counted_and_the_others_are_published(tmp_path: Pat
         probe = plant.probe("plant/#")
         plant.run()
         probe.until("plant/pump/valve", "false")
-        wire.until(lambda: plant.status()["not_accepted"] == 3, "counted")
+        # Published again at once, then not for a minute.
+        wire.until(lambda: plant.count("refused") == plant.status()["not_accepted"] == 6, "counted")
+        wire.until(lambda: plant.count("sent") == 1, "so is the other one")
+
+
+@pytest.mark.parametrize(
+    ("payload", "topic"), [("plain", "plant/pump/temperature"), ("device", "plant/pump")]
+)
+def test_what_was_refused_is_published_once_the_broker_accepts_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, payload: str, topic: str
+) -> None:
+    monkeypatch.setattr(sending, "RENEWAL_INTERVAL_S", 0.05)
+    rules = tmp_path / "acl"
+    rules.write_text("topic read #\n")
+    with Plant(tmp_path, "allow_anonymous true", f"acl_file {rules}") as plant:
+        plant.device()
+        probe = plant.probe("#")
+        plant.run(discovery="homeassistant", payload=payload)
+        wire.until(lambda: plant.count("refused") >= 4, "refused")
+        rules.write_text("topic readwrite #\n")
+        plant.broker.reload()
+        missing = {
+            topic,
+            "plant/holdfast/status",
+            "plant/holdfast/status/pump",
+            "homeassistant/sensor/holdfast_home/pump--flow/config",
+        }
+        while missing:
+            missing.discard(probe.get().topic)
 
 
 def test_a_refused_message_that_has_no_value_is_reported_too(

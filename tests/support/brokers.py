@@ -122,6 +122,10 @@ class Mosquitto(Broker):
         file.write_text("\n".join(lines) + "\n")
         return [tool("mosquitto"), "-v", "-c", str(file)]
 
+    def reload(self) -> None:
+        """Has it read its configuration again, with the access list."""
+        self._signal(signal.SIGHUP)
+
     def publish(self, topic: str, message: str, *options: str) -> None:
         """Publishes with Mosquitto's own tool."""
         command = [tool("mosquitto_pub"), "-h", self.host, "-p", str(self.port), "-t", topic]

@@ -47,7 +47,7 @@ class Payloads:
         messages = []
         for reading in readings:
             device, tag = reading[0], reading[1]
-            topic = topics.get((device, tag.name)) or self._topic(device, tag)
+            topic = topics.get((device, tag.name)) or self.topic(reading)
             messages.append(Message(topic, payload(reading), retain))
         return messages
 
@@ -75,9 +75,12 @@ class Payloads:
             if device in tags
         }
 
-    def _topic(self, device: str, tag: Tag) -> bytes:
-        topic = packed_topic(self._names.of_tag(device, tag.name))
-        self._topics[device, tag.name] = topic
+    def topic(self, reading: Reading) -> bytes:
+        """The topic of the message that has a reading."""
+        device, tag = reading.device, reading.tag
+        is_shared = self._form == "device"
+        name = self._names.of_device(device) if is_shared else self._names.of_tag(device, tag.name)
+        topic = self._topics[device, tag.name] = packed_topic(name)
         return topic
 
     def _of_devices(self, readings: list[Reading]) -> Iterator[Message]:
@@ -98,7 +101,7 @@ class Payloads:
             time = _time(max(reading.time for reading in group))
             filled = {key: known[key] for key in ("values", "states", "errors") if known[key]}
             payload = _json.encode({"time": time, **filled})
-            yield Message(packed_topic(self._names.of_device(device)), payload, self._retain)
+            yield Message(self.topic(group[0]), payload, self._retain)
 
     def _begin(self, device: str) -> None:
         known = self._known.get(device)

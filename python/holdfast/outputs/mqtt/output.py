@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
+from math import inf
 from typing import TYPE_CHECKING
 
 from holdfast.config.values.mqtt_output_topics import DEFAULT_STATUS
+from holdfast.outputs import sending
 from holdfast.outputs.mqtt.availability import OFFLINE, ONLINE, Availability
 from holdfast.outputs.mqtt.commands import Commands
 from holdfast.outputs.mqtt.delivery import Message, packed_topic, unpacked_topic
@@ -14,6 +17,7 @@ from holdfast.outputs.mqtt.home_assistant import Discovery
 from holdfast.outputs.mqtt.messages import Payloads
 from holdfast.outputs.mqtt.receiver import BrokerReceiver
 from holdfast.outputs.mqtt.session import Session
+from holdfast.outputs.sending import Refused
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence, Set
@@ -54,11 +58,16 @@ class MqttOutput(BrokerReceiver):
         self._is_born = threading.Event()
         self._has_sent = True
         """Whether the broker has confirmed values since all were offered again."""
+        self._refused: dict[bytes, str] = {}
+        """The topics of new refusals of the broker, with its reasons."""
+        self._has_lost, self._renewed_at = False, -inf
+        """Whether some are of availability or entities, and when all of them were repeated."""
 
     def send(self, readings: list[Reading]) -> None:
         """Publishes readings, and waits until the broker has confirmed them.
 
-        If it fails and is called with the same readings, it goes on where it was.
+        If it fails and is called with the same readings, it goes on where it was. Raises `Refused`
+        for those that the broker did not accept.
         """
         session = self._connected()
         self._keep_up(session)
@@ -80,12 +89,14 @@ class MqttOutput(BrokerReceiver):
         self._payloads.settle(sent=True)
         self._taken, self._messages = [], ()
         self._publish_availability(session, answering=True)
+        self._settle_refused([each for each in readings if each.device not in standby])
 
     def idle(self) -> bool:
         """Keeps the connection, and publishes what has changed besides values."""
         session = self._connected()
         self._keep_up(session)
         self._publish_availability(session, answering=True)
+        self._settle_refused([])
         return True
 
     def close(self) -> None:
@@ -125,6 +136,11 @@ class MqttOutput(BrokerReceiver):
 
     def _keep_up(self, session: Session) -> None:
         """Publishes what has to be known before values."""
+        now = time.monotonic()
+        if self._has_lost and now >= self._renewed_at + sending.RENEWAL_INTERVAL_S:
+            self._has_lost, self._renewed_at = False, now
+            self._availability.begin()
+            self._is_born.set()
         self._forget_removed()
         revision = self._site.revision
         if revision != self._revision:
@@ -190,6 +206,29 @@ class MqttOutput(BrokerReceiver):
         for topic in (unpacked_topic(message.topic) for message in removal.messages):
             if self._site.retained.get((self._broker, topic)) == self._name:
                 del self._site.retained[self._broker, topic]
+
+    def _on_refused(self, message: Message, reason: str) -> None:
+        super()._on_refused(message, reason)
+        self._refused[message.topic] = reason
+
+    def _settle_refused(self, readings: Sequence[Reading]) -> None:
+        """Raises `Refused` for readings that the broker did not accept.
+
+        Notes whether it refused availability or entities. Replies to commands are not repeated.
+        """
+        refused: dict[bytes, str] = {}
+        while self._refused:  # Filled by the thread of the connection.
+            topic, reason = self._refused.popitem()
+            refused[topic] = reason
+        if not refused:
+            return
+        names = self._topics
+        own = {names.status, *map(names.of_availability, self._tags), *self._entities}
+        self._has_lost |= not own.isdisjoint(map(unpacked_topic, refused))
+        lost = [each for each in readings if self._payloads.topic(each) in refused]
+        if lost:
+            topic = self._payloads.topic(lost[0])
+            raise Refused(f"{unpacked_topic(topic)}: {refused[topic]}", lost)
 
     def _topics_of(self, tags: Mapping[str, set[str]]) -> set[str]:
         """The retained topics of the output, its devices and tags."""
