@@ -17,7 +17,7 @@ from holdfast.outputs import text_file
 from holdfast.outputs.sqlite_file import Database
 from holdfast.outputs.text_file import HEAD, TextFile
 from support.line_protocol import parsed
-from support.readings import reading, tag
+from support.readings import numbered, reading, tag
 from support.renaming import not_renamed
 
 if TYPE_CHECKING:
@@ -342,6 +342,21 @@ def test_old_rows_go_when_a_database_is_too_large(tmp_path: Path) -> None:
     database.close()
     assert (last, count) == (39_999, 40_000 - first)
     assert 0 < first < 35_000
+
+
+def test_rows_are_stored_once_if_old_ones_can_not_be_removed(tmp_path: Path) -> None:
+    database = Database(settings(tmp_path / "a.db", "sqlite", max_bytes=2**20))
+    database.send(numbered(10_000))
+    assert database._db is not None
+    answers = {True: sqlite3.SQLITE_DENY, False: sqlite3.SQLITE_OK}
+    # The next connection has no such rule.
+    database._db.set_authorizer(lambda action, *_: answers[action == sqlite3.SQLITE_DELETE])
+    with pytest.raises(OSError, match=r"a\.db: not authorized"):
+        database.send(numbered(100, 10_000))
+    database.send(numbered(100, 10_000))
+    rows = database._db.execute("SELECT count(*) FROM readings WHERE value >= 10000").fetchone()
+    database.close()
+    assert rows == (100,)
 
 
 def test_rows_of_a_clock_that_was_in_the_future_go_first(tmp_path: Path) -> None:

@@ -42,12 +42,13 @@ class Database(Receiver):
         """Inserts rows. They survive a power cut when this returns."""
         with file_errors(self._file, self.close):
             db = self._opened()
+            # First: after the rows are stored, an error would have them sent and stored again.
+            self._shrink(db)
             with db:
                 db.executemany(
                     "INSERT INTO readings VALUES (?, ?, ?, ?, ?, ?)",
                     [_row(reading) for reading in readings],
                 )
-            self._shrink(db)
 
     def close(self) -> None:
         """Closes the database."""
