@@ -344,6 +344,20 @@ def test_old_rows_go_when_a_database_is_too_large(tmp_path: Path) -> None:
     assert 0 < first < 35_000
 
 
+def test_a_small_database_is_never_emptied(tmp_path: Path) -> None:
+    database = Database(settings(tmp_path / "a.db", "sqlite", max_bytes=65536))
+    counts = []
+    for start in range(0, 2000, 100):
+        database.send(numbered(100, start))
+        assert database._db is not None
+        rows = database._db.execute("SELECT value FROM readings ORDER BY rowid").fetchall()
+        counts.append(len(rows))
+        assert rows == [(number,) for number in range(start + 100 - len(rows), start + 100)]
+    database.close()
+    assert counts[-1] < 1000
+    assert min(counts[5:]) > 200
+
+
 def test_rows_are_stored_once_if_old_ones_can_not_be_removed(tmp_path: Path) -> None:
     database = Database(settings(tmp_path / "a.db", "sqlite", max_bytes=2**20))
     database.send(numbered(10_000))

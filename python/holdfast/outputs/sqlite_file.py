@@ -26,7 +26,7 @@ CREATE INDEX IF NOT EXISTS readings_by_time ON readings (time);
 """
 
 MAX_ROWS_PER_REMOVAL = 1000
-"""Rows that are removed at once if the database is too large."""
+"""Limit of rows that are removed at once if the database is too large; of few, it is a tenth."""
 
 
 class Database(Receiver):
@@ -75,14 +75,15 @@ class Database(Receiver):
     def _shrink(self, db: sqlite3.Connection) -> None:
         """Removes the oldest rows if there are too many."""
         while self._size(db) > self._max_bytes:
-            with db:
-                gone = db.execute(
-                    "DELETE FROM readings WHERE rowid IN "
-                    f"(SELECT rowid FROM readings ORDER BY rowid LIMIT {MAX_ROWS_PER_REMOVAL})"
-                ).rowcount
-            db.executescript("PRAGMA incremental_vacuum")  # `execute` would free one page.
-            if gone < MAX_ROWS_PER_REMOVAL:
+            first, last = db.execute(
+                "SELECT (SELECT min(rowid) FROM readings), (SELECT max(rowid) FROM readings)"
+            ).fetchone()
+            if first is None:
                 return
+            gone = min(MAX_ROWS_PER_REMOVAL, 1 + (last - first) // 10)
+            with db:
+                db.execute("DELETE FROM readings WHERE rowid < ?", (first + gone,))
+            db.executescript("PRAGMA incremental_vacuum")  # `execute` would free one page.
 
     @staticmethod
     def _size(db: sqlite3.Connection) -> int:
