@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -144,6 +145,10 @@ def test_no_two_tags_have_one_id() -> None:
     [
         (tag(), 1.5, "1.5"),
         (tag(), None, "None"),
+        (tag(area="holding_registers", writable=True, min=-5, max=30.5), 30.5, "30.5"),
+        (tag(area="holding_registers", writable=True, min=-5, max=30), 30.5, "None"),
+        (tag(area="holding_registers", writable=True, min=-5, max=30), None, "None"),
+        (tag(area="holding_registers", type="float32", writable=True), -math.inf, "None"),
         (tag(type="uint16", states=STATES), 1, "it's on"),
         (tag(type="uint16", states=STATES), 7, "None"),
         (tag(type="uint16", scale=0.5, states=STATES), 1.0, "it's on"),

@@ -111,7 +111,8 @@ class Entity:
             value_json = json.loads(text)
         except ValueError:
             value_json = None
-        return str(eval(code, {"__builtins__": {}}, {"value": text, "value_json": value_json}))
+        names = {"value": text, "value_json": value_json, "float": float}
+        return str(eval(code, {"__builtins__": {}}, names))
 
 
 def entity(topic: str, payload: bytes) -> Entity:

@@ -130,7 +130,7 @@ class Discovery:
                 entity = {
                     "name": tag.description or tag.name,
                     "unique_id": f"{self._node}_{place}",
-                    **self._state(device, tag),
+                    **self._state(device, tag, own),
                     **own,
                     **shared,
                 }
@@ -220,12 +220,16 @@ class Discovery:
             return "number", {**own, **_bounds(tag), "mode": "box", **command}
         return "sensor", {**own, "state_class": state_class}
 
-    def _state(self, device: str, tag: Tag) -> dict[str, str]:
-        """Where the state of an entity is. No value, and one without a name, is `None`."""
+    def _state(self, device: str, tag: Tag, own: dict[str, Any]) -> dict[str, str]:
+        """Where the state of an entity is. No value, and one without a name, is `None`.
+
+        So is a number beyond its bounds: Home Assistant would go on to show the one before.
+        """
         form = self._settings.payload
         named = bool(tag.states)
         if form == "plain":
             known = f"in {_listed(tag.states.values())}" if named else "!= ''"
+            known += _within(own, "float(value)")
             template = f"{{{{ value if value {known} else '{NONE}' }}}}"
             return {"state_topic": self._names.of_tag(device, tag.name), "value_template": template}
         if form == "json":
@@ -238,7 +242,7 @@ class Discovery:
         if not named and tag.of_type.base in ("bool", "bit"):
             found = f"{{true: 'true', false: 'false'}}.get({found}, '{NONE}')"
         else:
-            found = f"{found} if {found} is not none else '{NONE}'"
+            found = f"{found} if {found} is not none{_within(own, found)} else '{NONE}'"
         return {"state_topic": topic, "value_template": f"{{{{ {found} }}}}"}
 
 
@@ -255,6 +259,11 @@ def _bounds(tag: Tag) -> dict[str, float]:
     low = low if tag.min is None else tag.min
     high = high if tag.max is None else tag.max
     return {"min": low, "max": high, "step": step}
+
+
+def _within(own: dict[str, Any], value: str) -> str:
+    """A condition in a template: the bounds of an entity, if it has some."""
+    return f" and {own['min']} <= {value} <= {own['max']}" if "min" in own else ""
 
 
 def _listed(names: Any) -> str:
