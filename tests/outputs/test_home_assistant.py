@@ -69,6 +69,8 @@ MOVING = RegisterScale("exponent", source=Tag("", "holding_registers", 1, "int16
 COMPONENTS = [
     (tag(unit="W"), "sensor"),
     (tag(area="holding_registers", type="int16", scale=MOVING, writable=True), "sensor"),
+    (tag(area="holding_registers", writable=True, min=5, max=5), "sensor"),
+    (tag(area="holding_registers", writable=True, min=2e9), "sensor"),
     (tag(type="string:4"), "sensor"),
     (tag(type="uint16", states=STATES), "sensor"),
     (tag(area="coils", type="bool"), "binary_sensor"),

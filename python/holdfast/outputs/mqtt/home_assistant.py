@@ -216,8 +216,8 @@ class Discovery:
         own = {"unit_of_measurement": tag.unit} if tag.unit else {}
         if device_class is not None:
             own["device_class"] = device_class
-        if writes:
-            return "number", {**own, **_bounds(tag), "mode": "box", **command}
+        if writes and (bounds := _bounds(tag))["min"] < bounds["max"]:
+            return "number", {**own, **bounds, "mode": "box", **command}
         return "sensor", {**own, "state_class": state_class}
 
     def _state(self, device: str, tag: Tag, own: dict[str, Any]) -> dict[str, str]:
