@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -475,6 +475,41 @@ def test_a_cancelled_wait_ends_neither_the_iteration_nor_loses_its_batch(
     asyncio.run(steps())
 
 
+def test_batches_of_two_cancelled_waits_come_in_order(
+    device: holdfast.Server, poller: Poller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, ends = ([threading.Event(), threading.Event()] for _ in range(2))
+    made = list[Batch]()
+
+    def late(polls: list[DevicePoll]) -> Batch:
+        made.append(Batch(polls))
+        number = len(made) - 1
+        if number < 2:
+            begun[number].set()
+            ends[number].wait(wire.DEADLINE)
+        return made[number]
+
+    monkeypatch.setattr(poller_module, "Batch", late)
+    poller.add(url(device), {"x": ("coils", 3)}, interval=0.01)
+
+    async def steps() -> None:
+        for waiting, has_begun, end in zip(
+            [asyncio.ensure_future(anext(aiter(poller))) for _ in range(2)],
+            begun,
+            ends,
+            strict=True,
+        ):
+            assert await asyncio.to_thread(has_begun.wait, wire.DEADLINE)
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+            end.set()
+
+    asyncio.run(steps())
+    came = [poller.take(wire.DEADLINE) for _ in range(3)]
+    assert [made.index(batch) for batch in came if batch is not None] == [0, 1, 2]
+
+
 def test_a_batch_that_failed_after_its_wait_was_cancelled_is_one_error(
     device: holdfast.Server, poller: Poller, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -496,8 +531,19 @@ def test_a_batch_that_failed_after_its_wait_was_cancelled_is_one_error(
         with pytest.raises(asyncio.CancelledError):
             await waiting
 
+    result = Future.result
+
+    def ends_at_the_timeout(waiting: Future[Batch | None], timeout: float | None) -> Batch | None:
+        try:
+            return result(waiting, timeout)
+        except TimeoutError:
+            is_cancelled.set()
+            wire.until(waiting.done, "the batch has failed")
+            raise
+
     asyncio.run(steps())
-    is_cancelled.set()
+    monkeypatch.setattr(Future, "result", ends_at_the_timeout)
+    assert poller.take(0) is None
     with pytest.raises(MemoryError):
         poller.take(wire.DEADLINE)
     assert len(taken(poller)) > 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 import itertools
 import math
 import os
@@ -100,9 +101,10 @@ class Poller:
         self._generations = itertools.count(1)
         self._process = os.getpid()
         self._thread: OwnThread | None = None
-        self._given_up: deque[Future[Batch | None]] = deque()
-        """Batches that a task waited for until it was cancelled. The first goes to whoever asks
-        next, also in another event loop.
+        self._numbers = itertools.count()
+        self._given_up: list[tuple[int, Future[Batch | None]]] = []
+        """Batches that a task waited for until it was cancelled: a heap, by the order in which they
+        were asked for. The first goes to whoever asks next, also in another event loop.
         """
         self._has_ended = False
         self._queued: deque[tuple[str, float, list[Any]]] = deque()
@@ -262,12 +264,13 @@ class Poller:
             timeout = checked_seconds("timeout", timeout, math.inf, -math.inf)
         began = time.monotonic()
         if self._given_up:
-            asked = self._given_up.popleft()
+            number, asked = heapq.heappop(self._given_up)
             try:
                 batch = asked.result(timeout and min(timeout, MAX_TIMEOUT_S))
             except BaseException as error:
-                if not (asked.done() and asked.exception()):
-                    self._given_up.appendleft(asked)
+                if asked.done() and error is asked.exception():
+                    raise
+                heapq.heappush(self._given_up, (number, asked))
                 if isinstance(error, TimeoutError):
                     return None
                 raise
@@ -330,14 +333,15 @@ class Poller:
         while True:
             self._check_process()
             if self._given_up:
-                asked = self._given_up.popleft()
+                number, asked = heapq.heappop(self._given_up)
             else:
+                number = next(self._numbers)
                 asked = self._thread.submit(partial(self._within, ABANDON_CHECK_S))
             try:
                 batch = await asyncio.wrap_future(asked)
             except (asyncio.CancelledError, GeneratorExit):
                 if not asked.cancel():  # It has begun.
-                    self._given_up.appendleft(asked)
+                    heapq.heappush(self._given_up, (number, asked))
                 raise
             if batch is not None or self._has_ended:
                 return batch
