@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import itertools
 import json
 import re
 import signal
@@ -14,12 +15,23 @@ from typing import TYPE_CHECKING
 import pytest
 
 import holdfast
+from holdfast.client import SyncClient
 from holdfast.discovery import device_search
 from holdfast.server import Identity
 from support import cli, lines, wire
 from support.cli import answer, done, failure, usage_error
 from support.commands import Command
-from support.fake_device import FakeDevice, Late, Serial, Stream, Udp, exception, registers, silent
+from support.fake_device import (
+    HANG_UP,
+    FakeDevice,
+    Late,
+    Serial,
+    Stream,
+    Udp,
+    exception,
+    registers,
+    silent,
+)
 from support.terminal import Terminal, plain
 
 if TYPE_CHECKING:
@@ -274,20 +286,49 @@ def test_a_device_that_ignores_unit_ids_is_told() -> None:
     assert shown[-1] == "The device answers every unit id: it probably ignores them."
 
 
-def test_a_device_that_ignores_what_comes_first_is_found() -> None:
+def ignores_two(reply: bytes | None) -> Behaviour:
+    """Unit id 1 of a device that answers from the third request on."""
+    asked_so_far = itertools.count(1)
+
     def behave(asked: Asked) -> None:
-        if len(host.requests) > 2 and asked.unit == 1:
+        if next(asked_so_far) <= 2:
+            asked.end_with(reply)
+        elif asked.unit == 1:
             asked.answer(registers(asked.pdu) if asked.pdu[0] == 3 else exception(asked.pdu, 1))
 
-    for command in (("find", "--units", "1-3"), ("find", "--port"), ("describe", "--units", "1-3")):
-        with Stream("tcp", then=behave) as host:
-            name, option, *values = command
-            target = [host.url, option, *values]
-            if option == "--port":
-                address, port = host.url.removeprefix("tcp://").split(":")
-                target = [address, option, port]
-            shown = cli.invoke(name, *target, "--timeout", "0.3").stdout
-        assert "1  answers" in shown or "Unit 1 answers." in shown
+    return behave
+
+
+@pytest.mark.parametrize("command", ["find", "describe", "find network"])
+@pytest.mark.parametrize("first", [None, HANG_UP], ids=["silent", "closes"])
+def test_a_device_that_ignores_what_comes_first_is_found(command: str, first: bytes | None) -> None:
+    def is_found(timeout: float) -> bool:
+        with Stream("tcp", then=ignores_two(first)) as host:
+            target = [host.url, "--units", "1-3"]
+            if command == "find network":
+                target = ["127.0.0.1", "--port", str(host.port)]
+            name, *_ = command.split()
+            shown = cli.invoke(name, *target, "--timeout", str(timeout)).stdout
+        return "1  answers" in shown or "Unit 1 answers." in shown
+
+    wire.until_long_enough(is_found, "unit id 1 answers")
+
+
+def test_a_device_on_a_line_that_ignores_what_comes_first_is_found(tmp_path: Path) -> None:
+    def is_found(timeout: float) -> bool:
+        with Serial(lines.RTU, tmp_path / "line", then=ignores_two(None)) as line:
+            options = ("--units", "1-3", "--timeout", str(timeout))
+            return "1  answers" in cli.invoke("find", line.url, *options).stdout
+
+    wire.until_long_enough(is_found, "unit id 1 answers")
+
+
+def test_unit_ids_are_yielded_as_soon_as_they_were_asked() -> None:
+    with Stream("tcp", then=silent) as host, SyncClient(host.url, timeout=0.05) as client:
+        found = device_search.units(client, [1, 2, 3])
+        assert next(found).unit == 1
+        assert all(each.unit == 1 for each in host.requests)
+        assert [each.unit for each in found] == [2, 1, 3]
 
 
 def test_silence_after_connecting_is_a_hint() -> None:
@@ -302,27 +343,28 @@ def test_silence_after_connecting_is_a_hint() -> None:
     wire.until_long_enough(is_hinted, "the host accepts connections")
 
 
+def not_modbus(asked: Asked) -> None:
+    asked.send(b"HTTP/1.0 400 Bad Request\r\n\r\n")
+
+
 @pytest.mark.parametrize(
     ("kind", "behave"),
     [
         ("tcp", lambda asked: asked.answer(exception(asked.pdu, 0x0B))),
-        ("tcp", lambda asked: asked.send(b"HTTP/1.0 400 Bad Request\r\n\r\n")),
+        ("tcp", not_modbus),
+        ("tcp", lambda asked: not_modbus(asked) if asked.unit == 1 else None),
         ("udp", silent),
         ("rtu+udp", silent),
     ],
-    ids=["gateway", "web server", "udp", "rtu+udp"],
+    ids=["gateway", "web server", "invalid, then silent", "udp", "rtu+udp"],
 )
-def test_unit_ids_that_are_not_silent_after_connecting_are_asked_once(
-    kind: str, behave: Behaviour
-) -> None:
+def test_what_is_not_silent_after_connecting_gets_no_hint(kind: str, behave: Behaviour) -> None:
     is_tcp = kind == "tcp"
     with Stream(kind, then=behave) if is_tcp else Udp(then=behave, kind=kind) as host:
         quick = () if is_tcp else ("--timeout", "0.05")
         assert failure("find", host.url, "--units", "1-2", *quick) == []
-        # Over UDP, a read is sent several times within its timeout.
-        assert [*dict.fromkeys(each.unit for each in host.requests)] == [1, 2]
-        assert host.requests[-1].unit == 2
         if is_tcp:
+            assert [each.unit for each in host.requests] == [1, 2]
             port = host.url.rpartition(":")[2]
             assert cli.invoke("find", "127.0.0.1", "--port", port).stderr == ""
 

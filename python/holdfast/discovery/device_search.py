@@ -76,7 +76,7 @@ class Host:
     longest_late: float = 0.0
     """How many seconds its slowest late reply took; 0 if there was none."""
     is_mute: bool = False
-    """As of a unit id, see `Unit`."""
+    """Whether connections were made, and no unit id got a reply or was disconnected."""
 
     @property
     def url(self) -> str:
@@ -95,8 +95,10 @@ class Unit:
     identity: Identity = Identity()
     is_garbled: bool = False
     """Whether bytes came that are not a valid reply: the settings of a line may be wrong."""
+    is_silent: bool = False
+    """Whether no reply came: it may have been asked too soon."""
     is_mute: bool = False
-    """Whether a connection was made and no reply came: it may have been asked too soon."""
+    """Whether it is silent on a connection that stays open."""
 
 
 @dataclass
@@ -199,7 +201,8 @@ async def _ask(host: Host, client: Client, units: Sequence[int]) -> None:
         except (RequestTimeout, ConnectionLost, InvalidResponse) as error:
             if isinstance(error, RequestTimeout) and not error.maybe_sent:
                 return  # No connection was made: the other unit ids would wait as long.
-            host.is_mute = isinstance(error, RequestTimeout)
+            is_first = host.state == "silent"
+            host.is_mute = isinstance(error, RequestTimeout) and (is_first or host.is_mute)
             if host.state != "modbus":
                 host.state = "open"
                 host.detail = str(error)
@@ -218,25 +221,21 @@ def _unreachable(error: ConnectFailed) -> State:
 
 
 def units(client: SyncClient, unit_ids: Sequence[int], *, delay: float = 0.0) -> Iterator[Unit]:
-    """Asks unit ids one by one, and yields each. Raises `ConnectFailed`.
+    """Asks unit ids one by one, and yields each at once. Raises `ConnectFailed`.
 
-    If the first two do not reply, the first is asked once more: some devices ignore what comes soon
-    after connecting, and after three timeouts the connection is another one.
+    If the first two do not reply, the first is asked and yielded once more: some devices ignore
+    what comes soon after connecting, and after three timeouts the connection is another one.
     """
-    head: list[Unit] = []
-    for unit in unit_ids[:2]:
-        if head:
+    is_silent = True
+    for count, unit in enumerate(unit_ids, 1):
+        if count > 1:
             pause(delay)
-        head.append(probe(client, unit, delay=delay))
-        if not head[-1].is_mute:
-            break
-    else:
-        pause(delay)
-        head[0] = probe(client, unit_ids[0], delay=delay)
-    yield from head
-    for unit in unit_ids[len(head) :]:
-        pause(delay)
-        yield probe(client, unit, delay=delay)
+        found = probe(client, unit, delay=delay)
+        is_silent = is_silent and found.is_silent
+        yield found
+        if is_silent and count == min(2, len(unit_ids)):
+            pause(delay)
+            yield probe(client, unit_ids[0], delay=delay)
 
 
 def probe(client: SyncClient, unit: int, *, delay: float = 0.0) -> Unit:
@@ -251,11 +250,13 @@ def probe(client: SyncClient, unit: int, *, delay: float = 0.0) -> Unit:
     except ConnectFailed:
         raise
     except ModbusError as error:
+        is_garbled = isinstance(error, InvalidResponse)
         return Unit(
             unit,
             answers=False,
             detail=str(error),
-            is_garbled=isinstance(error, InvalidResponse),
+            is_garbled=is_garbled,
+            is_silent=not is_garbled,
             is_mute=_connects(client) and isinstance(error, RequestTimeout) and error.maybe_sent,
         )
     return Unit(unit, answers=True, detail=detail, identity=_identify(client, unit, delay))

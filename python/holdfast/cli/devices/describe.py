@@ -179,12 +179,17 @@ class _Run:
     report: Report
 
     def __post_init__(self) -> None:
-        self.seen: list[Unit] = []
+        self._by_unit: dict[int, Unit] = {}
         self._alike: list[Unit] = []
         self._found: list[Description] = []
         self._files: list[str] = []
         self._unwritten: Ended | None = None
         """The error of the first file that could not be written."""
+
+    @property
+    def seen(self) -> list[Unit]:
+        """The unit ids that were asked."""
+        return list(self._by_unit.values())
 
     @property
     def _answering(self) -> list[Unit]:
@@ -246,7 +251,7 @@ class _Run:
         with self.report.progress("Asking", len(asked), lambda: ""):
             for unit in device_search.units(client, asked, delay=delay):
                 with self.report.held():
-                    self.seen.append(unit)
+                    self._by_unit[unit.unit] = unit
                     self.report.advance(len(self.seen))
                     if unit.answers:
                         self.report.text(f"Unit {unit.unit} answers.")

@@ -48,7 +48,8 @@ def find_units(
         most = (len(unit_ids) + 1) * (timeout + delay)  # The first is asked twice.
         told = f"{len(unit_ids)} unit ids, at most {most:.0f} s if none answers. Ctrl-C stops."
         click.echo(told, err=True)
-    found: list[Unit] = []
+    by_unit: dict[int, Unit] = {}
+    found = by_unit.values()
     with interruptions() as signals:
         report = Report({"target": url}, signals)
         alike: list[Unit] = []
@@ -58,29 +59,29 @@ def find_units(
             with report.progress("Finding", len(unit_ids), lambda: f"{_count(found)} found"):
                 for unit in device_search.units(client, unit_ids, delay=delay):
                     with report.held():
-                        found.append(unit)
+                        by_unit[unit.unit] = unit
                         if unit.answers:
                             _print(unit, report, is_first=_count(found) == 1)
                         report.advance(len(found))
-                alike = device_search.like_unusual(client, found, is_line=is_line, delay=delay)
+                alike = device_search.like_unusual(client, [*found], is_line=is_line, delay=delay)
 
         with device.connect(url, unit_ids[0], timeout) as client:
             why = report.attempt(search, url, lambda: _count(found))
         not_asked = unit_ids[len(found) :]
-        report.text(*_units(url, found, not_asked, alike))
+        report.text(*_units(url, [*found], not_asked, alike))
         report.end(
             {
                 **ended_to_json(why or (None if _count(found) else NOTHING)),
                 "complete": why is None,
                 "garbled": _garbled(found),
-                **ignored_to_json(found, alike),
+                **ignored_to_json([*found], alike),
                 "asked": [each.unit for each in found],
                 "not_asked": list(not_asked),
             }
         )
     if why is not None and not as_json:
         click.echo(f"holdfast: {url}: {why}", err=True)
-    hint_at_silence(url, found, client.longest_late)
+    hint_at_silence(url, [*found], client.longest_late)
     if why is not None or not _count(found):
         sys.exit(ExitCode.FAILED)
 
