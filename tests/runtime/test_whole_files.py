@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from typing import TYPE_CHECKING
@@ -46,6 +47,22 @@ def test_a_file_keeps_its_owner_but_not_one_with_a_secret(tmp_path: Path) -> Non
     whole_files.replace(file, b"3", whole_files.SECRET)
     assert (file.stat().st_uid, file.stat().st_gid) == (os.geteuid(), os.getegid())
     assert (file.stat().st_mode & 0o777, file.read_bytes()) == (0o600, b"3")
+
+
+def test_a_file_is_replaced_where_none_can_be_given_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    file = tmp_path / "file"
+    file.write_bytes(b"1")
+    before = file.stat()
+    monkeypatch.setattr(os, "chown", refuse)
+    with file.open("rb") as reader:
+        whole_files.replace(file, b"2")
+        assert reader.read() == b"1"
+    assert (file.stat().st_mode, file.read_bytes()) == (before.st_mode, b"2")
 
 
 def test_a_private_file_is_private_while_it_is_replaced(
@@ -111,6 +128,9 @@ def test_a_file_that_can_be_neither_written_nor_given_to_its_owner_is_found_befo
     file.write_bytes(b"1")
     monkeypatch.setattr(os, "chown", refuse)
     whole_files.try_replace(file)
+    mode, inode, device, links, owner, *others = file.stat()
+    of_another = os.stat_result([mode, inode, device, links, owner + 1, *others])
+    monkeypatch.setattr(whole_files, "_before", lambda _: of_another)
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(PermissionError):
         whole_files.try_replace(file)

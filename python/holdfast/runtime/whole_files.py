@@ -95,8 +95,11 @@ def _beside(file: Path, content: bytes, mode: int, before: os.stat_result | None
     new.unlink(missing_ok=True)
     try:
         write_new({new: (content, mode if before is None else SECRET)})
-        if before is not None:
-            if sys.platform != "win32":
+        # On Windows, a mode can only make a file read-only, and then it can't be removed.
+        if before is not None and sys.platform != "win32":
+            made = new.stat()
+            # Some file systems refuse every `chown`.
+            if (made.st_uid, made.st_gid) != (before.st_uid, before.st_gid):
                 os.chown(new, before.st_uid, before.st_gid)
             new.chmod(stat.S_IMODE(before.st_mode))
         yield new
