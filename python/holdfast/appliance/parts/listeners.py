@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from holdfast import _core
 from holdfast.appliance.parts.native_listeners import identity, listener
 from holdfast.appliance.parts.part import Part
-from holdfast.config.models.listeners import ModbusAsciiListener, ModbusRtuListener, tls_of
+from holdfast.config.models.listeners import SerialListener, tls_of
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
 from holdfast.net.http.port import explained
@@ -146,7 +146,7 @@ class Listeners(Part):
         """Yields where each listener listens."""
         listeners = self.config.listeners.items()
         for (name, settings), address in zip(listeners, self.engine.addresses, strict=True):
-            if isinstance(settings, ModbusRtuListener | ModbusAsciiListener):
+            if isinstance(settings, SerialListener):
                 yield ListenAddress(name, settings.type, settings.serial.device, None, settings)
             elif address is not None:
                 yield ListenAddress(name, settings.type, *address, settings)
@@ -177,7 +177,7 @@ def _advising(config: Config) -> Iterator[None]:
         settings = config.listeners.get(name)
         if settings is None:
             raise
-        if isinstance(settings, ModbusRtuListener | ModbusAsciiListener):
+        if isinstance(settings, SerialListener):
             text = f"{text} ({GROUP})"
         else:
             text = explained(error, settings.bind.port)

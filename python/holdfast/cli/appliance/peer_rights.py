@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.cli.terminal_text import number_ranges, ranges_shown, styled, table, words
 from holdfast.config.models.listeners import (
-    DATAGRAM_TYPES,
-    ModbusAsciiListener,
-    ModbusRtuListener,
     ModbusTcpListener,
     RawIngestConfig,
     RawIngestListener,
+    SerialListener,
+    UdpListener,
     tls_of,
 )
 from holdfast.config.unit_rights import matching, together
@@ -58,7 +57,7 @@ def as_data(config: Config, peer: Peer) -> dict[str, Any]:
 
 def _place(listener: Listener) -> str:
     """The address or serial line of the listener."""
-    if isinstance(listener, ModbusRtuListener | ModbusAsciiListener):
+    if isinstance(listener, SerialListener):
         return str(listener.serial.device)
     return str(listener.bind)
 
@@ -66,12 +65,12 @@ def _place(listener: Listener) -> str:
 def _rights(listener: Listener, peer: Peer) -> tuple[str, dict[int, UnitRights]]:
     """What a Modbus listener does with the peer, and the rights of the peer by unit id."""
     assert not isinstance(listener, RawIngestListener), "its rules have no rights of units"
-    if isinstance(listener, ModbusRtuListener | ModbusAsciiListener):
+    if isinstance(listener, SerialListener):
         return "no_addresses", {}
     if not matching(listener.rules, peer.address):
         if _packet_rule(listener, peer) is not None:
             return "only_packets", {}
-        return "unanswered" if listener.type in DATAGRAM_TYPES else "disconnected", {}
+        return "unanswered" if isinstance(listener, UdpListener) else "disconnected", {}
     role = peer.role if listener.type == "modbus-tls" else None
     rules = matching(listener.rules, peer.address, role)
     return ("served", together(rules)) if rules else ("no_rights", {})

@@ -6,7 +6,8 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.checks.common import Owners, items, until_invalid
-from holdfast.config.models.listeners import CONNECTION_TYPES, DATAGRAM_TYPES, SERIAL_TYPES
+from holdfast.config.models.base import types_of
+from holdfast.config.models.listeners import SerialListener, TcpListener, UdpListener
 from holdfast.config.models.services import HTTP_SERVICES
 from holdfast.config.text.messages import show
 
@@ -20,10 +21,10 @@ if TYPE_CHECKING:
 
 def check_binds(scope: Scope) -> None:
     """Reports TCP binds that overlap, UDP binds that overlap, and serial ports used twice."""
-    _check_overlaps(scope, [*_listeners(scope, CONNECTION_TYPES), *_services(scope)])
-    _check_overlaps(scope, _listeners(scope, DATAGRAM_TYPES))
+    _check_overlaps(scope, [*_listeners(scope, types_of(TcpListener)), *_services(scope)])
+    _check_overlaps(scope, _listeners(scope, types_of(UdpListener)))
     devices = Owners(scope.report, "device")
-    for path, listener in _listeners(scope, SERIAL_TYPES):
+    for path, listener in _listeners(scope, types_of(SerialListener)):
         with until_invalid():
             device = listener.serial.device
             port = os.path.realpath(device)

@@ -17,10 +17,7 @@ from holdfast.client.tolerance import STRICT, Tolerance
 from holdfast.client.url import IN_FLIGHT, parse, parse_receiver
 from holdfast.config.checks.common import check_readable, given, items, until_invalid
 from holdfast.config.models.devices import DeviceConfig, RetryConfig, tolerating
-from holdfast.config.models.listeners import (
-    ModbusAsciiListener,
-    ModbusRtuListener,
-)
+from holdfast.config.models.listeners import SerialListener
 from holdfast.config.text.messages import show
 from holdfast.net.allow_list import AllowedDevice
 from holdfast.protocol import MAX_UNIT
@@ -219,7 +216,7 @@ def _serial_listeners(scope: Scope) -> Iterator[tuple[str, KeyPath]]:
     with until_invalid():
         for path, listener in items(("listeners",), scope.config.listeners):
             with until_invalid():
-                if isinstance(listener, ModbusRtuListener | ModbusAsciiListener):
+                if isinstance(listener, SerialListener):
                     yield os.path.realpath(listener.serial.device), path
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Self, get_args
 
 from pydantic import BaseModel, ConfigDict
 from pydantic_core import PydanticCustomError
@@ -53,3 +53,11 @@ class Model(BaseModel):
             if name in type(self).model_fields:
                 raise InvalidValue
             return super().__getattr__(name)
+
+
+def types_of(union: object) -> tuple[str, ...]:
+    """The values of `type` of the models of a union, in its order."""
+    models: tuple[type[Model], ...] = get_args(union)
+    return tuple(
+        word for model in models for word in get_args(model.model_fields["type"].annotation)
+    )

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 from pydantic import Discriminator, Field, Strict, Tag
 
 from holdfast.client.serial_settings import Parity, Rs485, SerialTarget, stop_bits
-from holdfast.config.models.base import Model
+from holdfast.config.models.base import Model, types_of
 from holdfast.config.models.connection_limits import ConnectionLimits, handshakes
 from holdfast.config.models.devices import RangeConfig
 from holdfast.config.models.server_tls import ServerTlsConfig
@@ -102,12 +102,14 @@ UNIT_TAGS = ("memory", "long", "route")
 
 def _tag_of(value: object) -> str:
     memory, long, route = UNIT_TAGS
-    if isinstance(value, UnitMemoryConfig) or (isinstance(value, dict) and _has_memory(value)):
+    if isinstance(value, UnitMemoryConfig) or (
+        isinstance(value, dict) and _seems_to_have_memory(value)
+    ):
         return long
     return route if isinstance(value, dict | RouteConfig) else memory
 
 
-def _has_memory(value: dict[Any, Any]) -> bool:
+def _seems_to_have_memory(value: dict[Any, Any]) -> bool:
     """Whether a mapping has the key of a memory, or a misspelled one."""
     return "memory" in value or (
         "route" not in value and any(suggestion(key, ("memory",)) for key in value)
@@ -213,7 +215,7 @@ class _ModbusLimits(ConnectionLimits):
     and mobile networks forget connections that are silent for a shorter time."""
 
 
-class _ConnectionListener(_ModbusRules, _ModbusLimits, _BoundListener):
+class _ModbusOverTcp(_ModbusRules, _ModbusLimits, _BoundListener):
     """Settings of all Modbus servers over TCP connections."""
 
 
@@ -244,7 +246,7 @@ class RawIngestConfig(Model):
     """The first rule whose sources contain the sender applies."""
 
 
-class ModbusTcpListener(_ConnectionListener):
+class ModbusTcpListener(_ModbusOverTcp):
     """A Modbus TCP server."""
 
     type: Literal["modbus-tcp"]
@@ -253,7 +255,7 @@ class ModbusTcpListener(_ConnectionListener):
     """Raw ingest packets on the same port. Default: none."""
 
 
-class ModbusTlsListener(_ConnectionListener):
+class ModbusTlsListener(_ModbusOverTcp):
     """A Modbus TCP server over TLS, for clients with a certificate (Modbus/TCP Security)."""
 
     type: Literal["modbus-tls"]
@@ -271,7 +273,7 @@ class ModbusTlsListener(_ConnectionListener):
         return handshakes(self.max_connections)
 
 
-class ModbusRtuOverTcpListener(_ConnectionListener):
+class ModbusRtuOverTcpListener(_ModbusOverTcp):
     """A server of Modbus RTU frames over TCP connections, as serial gateways send them."""
 
     type: Literal["modbus-rtu-over-tcp"]
@@ -280,7 +282,7 @@ class ModbusRtuOverTcpListener(_ConnectionListener):
     """Seconds without a byte after which an incomplete request is discarded."""
 
 
-class ModbusAsciiOverTcpListener(_ConnectionListener):
+class ModbusAsciiOverTcpListener(_ModbusOverTcp):
     """A server of Modbus ASCII frames over TCP connections, as serial gateways send them."""
 
     type: Literal["modbus-ascii-over-tcp"]
@@ -335,7 +337,7 @@ class AsciiSerialConfig(SerialConfig):
     """Data bits per character."""
 
 
-class _SerialListener(Model):
+class _ModbusOnSerialLine(Model):
     """Settings of all servers on a serial line."""
 
     type: str
@@ -348,7 +350,7 @@ class _SerialListener(Model):
     """What the client may do. For each unit id, the first rule that names it applies."""
 
 
-class ModbusRtuListener(_SerialListener):
+class ModbusRtuListener(_ModbusOnSerialLine):
     """A Modbus RTU server on a serial line."""
 
     type: Literal["modbus-rtu"]
@@ -357,7 +359,7 @@ class ModbusRtuListener(_SerialListener):
     """The serial port."""
 
 
-class ModbusAsciiListener(_SerialListener):
+class ModbusAsciiListener(_ModbusOnSerialLine):
     """A Modbus ASCII server on a serial line."""
 
     type: Literal["modbus-ascii"]
@@ -392,32 +394,21 @@ class RawIngestListener(ConnectionLimits, _BoundListener):
         return None if self.tls is None else handshakes(self.max_connections)
 
 
-Listener: TypeAlias = (
+TcpListener: TypeAlias = (
     ModbusTcpListener
     | ModbusTlsListener
     | ModbusRtuOverTcpListener
     | ModbusAsciiOverTcpListener
-    | ModbusUdpListener
-    | ModbusRtuOverUdpListener
-    | ModbusRtuListener
-    | ModbusAsciiListener
     | RawIngestListener
 )
+UdpListener: TypeAlias = ModbusUdpListener | ModbusRtuOverUdpListener
+SerialListener: TypeAlias = ModbusRtuListener | ModbusAsciiListener
+Listener: TypeAlias = TcpListener | UdpListener | SerialListener
+
+LISTENER_TYPES = types_of(Listener)
+"""All values of `type`."""
 
 
 def tls_of(listener: Listener) -> ServerTlsConfig | None:
     """The certificates of a listener; `None` without TLS."""
     return listener.tls if isinstance(listener, ModbusTlsListener | RawIngestListener) else None
-
-
-CONNECTION_TYPES = (
-    "modbus-tcp",
-    "modbus-tls",
-    "modbus-rtu-over-tcp",
-    "modbus-ascii-over-tcp",
-    "raw-ingest",
-)
-DATAGRAM_TYPES = ("modbus-udp", "modbus-rtu-over-udp")
-SERIAL_TYPES = ("modbus-rtu", "modbus-ascii")
-LISTENER_TYPES = (*CONNECTION_TYPES, *DATAGRAM_TYPES, *SERIAL_TYPES)
-"""All values of `type`; the tuples above group them by TCP, UDP and serial port."""

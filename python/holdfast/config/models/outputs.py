@@ -6,7 +6,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from pydantic import BeforeValidator, Field, Strict
 
-from holdfast.config.models.base import Model
+from holdfast.config.models.base import Model, types_of
 from holdfast.config.models.services import BrokerConfig, ClientTlsConfig, NatsServersConfig
 from holdfast.config.values.mqtt_output_topics import TopicNames
 from holdfast.config.values.scalars import (
@@ -190,9 +190,8 @@ class SparkplugConfig(OutputConfig, BrokerConfig):
     """Whether commands for writable tags are written to their devices."""
 
 
-OUTPUT_TYPES = ("influx", "mqtt", "sparkplug", "file", "nats")
-"""All values of `type`."""
-
 Output: TypeAlias = (
     InfluxConfig | MqttOutputConfig | SparkplugConfig | FileConfig | NatsOutputConfig
 )
+OUTPUT_TYPES = types_of(Output)
+"""All values of `type`."""
