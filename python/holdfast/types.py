@@ -87,7 +87,17 @@ Transport: TypeAlias = Literal["tcp", "tls", "udp", "rtu+tcp", "ascii+tcp", "rtu
 
 TRANSPORTS: tuple[Transport, ...] = get_args(Transport)
 
-SERIAL_FRAMES: tuple[Transport, ...] = ("rtu+tcp", "ascii+tcp", "rtu+udp")
+Framing: TypeAlias = Literal["mbap", "rtu", "ascii"]
+FRAMINGS: dict[str, Framing] = {
+    "tcp": "mbap",
+    "tls": "mbap",
+    "udp": "mbap",
+    "rtu+tcp": "rtu",
+    "ascii+tcp": "ascii",
+    "rtu+udp": "rtu",
+}
+"""The framing of each transport."""
+SERIAL_FRAMES = tuple(each for each in TRANSPORTS if FRAMINGS[each] != "mbap")
 """Those that carry the frames of a serial line. Unit id 0 is its broadcast."""
 
 WhenFull: TypeAlias = Literal["refuse", "evict"]

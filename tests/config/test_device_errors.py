@@ -39,7 +39,7 @@ ANOTHER = """\
 """
 URLS = (
     "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
-    "rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
+    "ascii+tcp://host:502, rtu+udp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
 )
 RECEIVER = "raw://10.0.2.9:9000 or raw+tls://10.0.2.9:9000?ca=ca.pem"
 READS = "  reads: a list"

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
 READ = bytes.fromhex("0300000001")
 ZERO = bytes.fromhex("03020000")
 WRITE = bytes.fromhex("0600001234")
-EVERY = ["udp", "rtu-udp", "rtu", "ascii"]
+EVERY = [kind for kind in TRANSPORTS if kind != "tcp"]
 FRAMERS = {None: FramerType.SOCKET, lines.RTU: FramerType.RTU, lines.ASCII: FramerType.ASCII}
 
 

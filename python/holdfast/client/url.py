@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from dataclasses import asdict, dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, get_args
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from holdfast.client.serial_settings import Mode, SerialTarget, stop_bits
@@ -25,9 +25,8 @@ if TYPE_CHECKING:
 
     from holdfast.types import Transport
 
-SERIAL = ("rtu", "ascii")
-ALL = (*TRANSPORTS, *SERIAL)
-MBAP = tuple(each for each in TRANSPORTS if each not in SERIAL_FRAMES)
+SERIAL_SCHEMES: tuple[Mode, ...] = get_args(Mode)
+SCHEMES = (*TRANSPORTS, *SERIAL_SCHEMES)
 
 MAX_SILENCE_S = 10.0
 """Seconds."""
@@ -38,11 +37,18 @@ SECURE = ("tls", "raw+tls")
 IN_FLIGHT: tuple[Transport, ...] = ("tcp", "tls")
 """The transports that allow several requests in flight."""
 
-FORMS = (
-    "tcp://host:502, tls://host:802?ca=ca.pem, udp://host:502, rtu+tcp://host:502, "
-    "rtu+udp://host:502, ascii+tcp://host:502, rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
-)
+SERIAL_FORMS = "rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
+"""Examples of serial lines in messages."""
 
+
+def _form(transport: Transport) -> str:
+    """An example of the URL of a device."""
+    tls = "?ca=ca.pem" if transport == "tls" else ""
+    return f"{transport}://host:{usual_port(transport)}{tls}"
+
+
+FORMS = ", ".join([*map(_form, TRANSPORTS), SERIAL_FORMS])
+"""Examples of all schemes in messages."""
 
 MAX_PAUSE_S = 60
 MAX_RETRIES = 10
@@ -134,9 +140,9 @@ def parse(url: str) -> Target:
         except ValueError as error:
             raise ValueError(f"{url!r}: {error}") from None
         return NetworkTarget(scheme, host, port, tls, tolerance)
-    if scheme in SERIAL:
-        return _serial(url, cast("Mode", scheme), parts.netloc + parts.path, parts.query)
-    near = suggestion(scheme, ALL) if scheme else ""
+    if scheme in SERIAL_SCHEMES:
+        return _serial(url, scheme, parts.netloc + parts.path, parts.query)
+    near = suggestion(scheme, SCHEMES) if scheme else ""
     raise ValueError(f"{_shown(url)} is not the URL of a device, allowed: {FORMS}{near}")
 
 
@@ -185,7 +191,7 @@ class _Option:
 
     allowed: str
     read: Callable[[str], Any]
-    schemes: tuple[str, ...] = SERIAL
+    schemes: tuple[str, ...] = SERIAL_SCHEMES
 
 
 def _one_of(*words: str, read: Callable[[str], Any] = str) -> _Option:
@@ -239,7 +245,7 @@ def _text(text: str) -> str:
     return text
 
 
-_FLAG = replace(_one_of("0", "1", read=lambda text: text == "1"), schemes=ALL)
+_FLAG = replace(_one_of("0", "1", read=lambda text: text == "1"), schemes=SCHEMES)
 
 OPTIONS: Mapping[str, _Option] = {
     "baud": _Option("50 to 4000000", _baud),
@@ -248,15 +254,15 @@ OPTIONS: Mapping[str, _Option] = {
     "data_bits": _one_of("7", "8", read=int),
     "silence": _Option("seconds, up to 10", _seconds, ("rtu",)),
     "rs485": _one_of("rts", "rts-low"),
-    "accept_unit": _Option(f"any, 0 to {MAX_UNIT}", _unit, ALL),
+    "accept_unit": _Option(f"any, 0 to {MAX_UNIT}", _unit, SCHEMES),
     "pad": _FLAG,
-    "echo": _Option("0, 1, auto", _echo, tuple(each for each in ALL if each not in MBAP)),
-    "pause": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, ALL),
-    "pause_after_connect": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, ALL),
-    "retries": _Option(f"0 to {MAX_RETRIES}", _up_to(MAX_RETRIES), ALL),
+    "echo": _Option("0, 1, auto", _echo, (*SERIAL_FRAMES, *SERIAL_SCHEMES)),
+    "pause": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, SCHEMES),
+    "pause_after_connect": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, SCHEMES),
+    "retries": _Option(f"0 to {MAX_RETRIES}", _up_to(MAX_RETRIES), SCHEMES),
     "retry_busy": _FLAG,
-    "close_after": _Option(f"0 to {MAX_CLOSE_AFTER}", _up_to(MAX_CLOSE_AFTER), ALL),
-    "reconnect": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, ALL),
+    "close_after": _Option(f"0 to {MAX_CLOSE_AFTER}", _up_to(MAX_CLOSE_AFTER), SCHEMES),
+    "reconnect": _Option(f"seconds, up to {MAX_PAUSE_S}", _pause, SCHEMES),
     "write_multiple": _FLAG,
     **dict.fromkeys(
         ("ca", "cert", "key", "key_passphrase_file"), _Option("paths of files", _text, SECURE)
@@ -275,6 +281,9 @@ def _pop_fields(kind: type[Any], options: dict[str, Any]) -> Any:
     )
 
 
+_UNIT_HINT = "; the unit id is not part of the URL: set it with unit, or --unit"
+
+
 def options_of(url: str, scheme: str, query: str) -> dict[str, Any]:
     """Parses a query with the options of a scheme."""
     options: dict[str, Any] = {}
@@ -283,7 +292,7 @@ def options_of(url: str, scheme: str, query: str) -> dict[str, Any]:
         option = OPTIONS.get(key)
         if option is None or scheme not in option.schemes:
             known = [name for name, each in OPTIONS.items() if scheme in each.schemes]
-            words = f"{listing(known)}{suggestion(key, known)}"
+            words = f"{listing(known)}{suggestion(key, known)}{_UNIT_HINT if key == 'unit' else ''}"
             raise ValueError(f"{_shown(url)}: unknown option {key!r}, allowed: {words}")
         if key in options:
             raise ValueError(f"{_shown(url)}: option {key!r} is given twice")

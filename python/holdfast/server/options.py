@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, TypedDict
 
 if TYPE_CHECKING:
     from holdfast._core import Listener, ServerTls
-    from holdfast.types import WhenFull
+    from holdfast.types import Framing, WhenFull
 
 
 class ServerOptions(TypedDict, total=False):
@@ -41,7 +41,7 @@ class ServerOptions(TypedDict, total=False):
 class StreamOptions(ServerOptions):
     """A listener for Modbus over connections."""
 
-    framing: Literal["mbap", "rtu", "ascii"]
+    framing: Framing
     max_handshakes: int
     """With TLS: the most connections that are not authenticated yet, beside `max_connections`."""
     raw_ingest: Listener | None

@@ -7,11 +7,9 @@ from collections.abc import Iterable, Mapping
 from operator import index
 from typing import (
     TYPE_CHECKING,
-    Literal,
     Self,
     SupportsFloat,
     SupportsIndex,
-    TypeAlias,
     TypeVar,
     Unpack,
     cast,
@@ -21,13 +19,13 @@ from urllib.parse import urlsplit
 from holdfast import _core
 from holdfast.client.serial_settings import SerialTarget
 from holdfast.client.tolerance import STRICT
-from holdfast.client.url import SERIAL, parse
+from holdfast.client.url import SERIAL_FORMS, SERIAL_SCHEMES, parse
 from holdfast.net.addresses import LOOPBACK
 from holdfast.protocol import MAX_SERIAL_UNIT, MAX_UNIT
 from holdfast.server.fork import close_in_children
 from holdfast.server.identity import Identity
 from holdfast.server.options import DEFAULTS, STREAM_DEFAULTS
-from holdfast.types import TRANSPORTS
+from holdfast.types import FRAMINGS, TRANSPORTS
 from holdfast.values.integers import as_boolean, as_integer
 
 if TYPE_CHECKING:
@@ -45,20 +43,10 @@ if TYPE_CHECKING:
 NAME = "server"
 
 Item = TypeVar("Item")
-Framing: TypeAlias = Literal["mbap", "rtu", "ascii"]
+_DATAGRAMS = ("udp", "rtu+udp")
 
-_CONNECTIONS: dict[str, Framing] = {
-    "tcp": "mbap",
-    "tls": "mbap",
-    "rtu+tcp": "rtu",
-    "ascii+tcp": "ascii",
-}
-_DATAGRAMS: dict[str, Literal["mbap", "rtu"]] = {"udp": "mbap", "rtu+udp": "rtu"}
-
-FORMS = (
-    "127.0.0.1:5020, tcp://127.0.0.1:5020, tls://127.0.0.1:5020, udp://127.0.0.1:5020, "
-    "rtu+tcp://127.0.0.1:5020, rtu+udp://127.0.0.1:5020, ascii+tcp://127.0.0.1:5020, "
-    "rtu:///dev/ttyUSB0?baud=19200&parity=even, ascii:///dev/ttyUSB0"
+FORMS = ", ".join(
+    ["127.0.0.1:5020", *(f"{each}://127.0.0.1:5020" for each in TRANSPORTS), SERIAL_FORMS]
 )
 
 _running: set[_core.Engine] = set()
@@ -113,7 +101,7 @@ class Server:
             if units is None or access is None:
                 raise TypeError("a server requires units and access, or rules")
             _check_units(units)
-            if sources is None and _split(bind)[0] not in SERIAL:
+            if sources is None and _split(bind)[0] not in SERIAL_SCHEMES:
                 sources = SOURCES
             rule = _core.Rule(
                 units,
@@ -220,14 +208,14 @@ def _listener(bind: str, rules: Sequence[Rule], options: ServerOptions) -> _core
     _check(scheme, options)
     for rule in rules:
         _check_rule(scheme, rule)
-    if scheme in SERIAL:
+    if scheme in SERIAL_SCHEMES:
         return _serial(bind, rules, options)
     if scheme in _DATAGRAMS:
-        datagrams = {**DEFAULTS, **options, "framing": _DATAGRAMS[scheme]}
+        datagrams = {**DEFAULTS, **options, "framing": FRAMINGS[scheme]}
         return _core.Listener.udp(NAME, address, rules, cast("DatagramOptions", datagrams))
     if scheme == "tls" and options.get("tls") is None:
         raise ValueError("tls:// requires tls, the certificates: holdfast.ServerTls(cert_file=…)")
-    stream: StreamOptions = {**STREAM_DEFAULTS, **options, "framing": _CONNECTIONS[scheme]}
+    stream: StreamOptions = {**STREAM_DEFAULTS, **options, "framing": FRAMINGS[scheme]}
     return _core.Listener(NAME, address, rules, stream)
 
 
@@ -235,7 +223,7 @@ def _check(scheme: str, options: ServerOptions) -> None:
     """Raises `ValueError` for an option that is set and has no effect with this scheme, `TypeError`
     for an unknown one and for a value of another type.
     """
-    if scheme in SERIAL:
+    if scheme in SERIAL_SCHEMES:
         allowed = {"event_log"}
     elif scheme in _DATAGRAMS:
         allowed = {"listen_only", "event_log"}
@@ -277,7 +265,7 @@ def _check_rule(scheme: str, rule: Rule) -> None:
         raise TypeError(f"found the rule {rule!r}, allowed: holdfast.Rule(…)")
     if scheme != "tls" and rule.roles is not None:
         raise ValueError(f"roles has no effect with {scheme}: omit it")
-    if scheme not in SERIAL:
+    if scheme not in SERIAL_SCHEMES:
         if rule.sources is None:
             raise ValueError(f"a rule requires sources with {scheme}, as in {NETWORKS}")
         return
@@ -296,7 +284,7 @@ def _split(bind: str) -> tuple[str, str]:
     scheme, separator, address = bind.partition("://")
     if not separator:
         return "tcp", bind
-    if scheme in SERIAL:
+    if scheme in SERIAL_SCHEMES:
         return scheme, bind
     if scheme not in TRANSPORTS or urlsplit(bind).netloc != address:
         raise ValueError(f"bind is {bind!r}, allowed: {FORMS}")

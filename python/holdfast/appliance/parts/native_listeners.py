@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, assert_never, cast
+from typing import TYPE_CHECKING, Any, assert_never, cast
 
 from holdfast import _core
 from holdfast.config.models.listeners import (
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
         SerialOptions,
         StreamOptions,
     )
-    from holdfast.types import BitArea, NarrowedRights
+    from holdfast.types import BitArea, Framing, NarrowedRights
 
-_FRAMINGS: dict[str, Literal["mbap", "rtu", "ascii"]] = {
+_FRAMINGS: dict[str, Framing] = {
     "modbus-tcp": "mbap",
     "modbus-tls": "mbap",
     "modbus-rtu-over-tcp": "rtu",
