@@ -49,7 +49,7 @@ class Part:
 
     closing_rank = 0
     """Parts with a higher rank are closed after all with a lower one, those of one rank backwards.
-    For parts that record or report the stop of others that were opened before."""
+    For parts that must outlive others that were opened after them."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
@@ -90,7 +90,10 @@ class Part:
         return ()
 
     def stats(self) -> Mapping[str, Any]:
-        """Counters and states for diagnostics, by their keys there. Thread-safe."""
+        """Counters and states for diagnostics, by their keys there. Thread-safe.
+
+        The mappings of all parts are merged into one: no two may have the same key.
+        """
         return {}
 
 
