@@ -25,7 +25,7 @@ from support.running import (
     Process,
     Run,
     Serve,
-    ServerOptions,
+    ServeOptions,
     ServerProcess,
 )
 
@@ -125,9 +125,9 @@ def serve() -> Iterator[Serve]:
     with ExitStack() as running:
 
         def start(
-            units: Mapping[int, holdfast.Memory], **options: Unpack[ServerOptions]
+            units: Mapping[int, holdfast.Memory], **options: Unpack[ServeOptions]
         ) -> holdfast.Server:
-            settings: ServerOptions = {"bind": "127.0.0.1:0", "access": "read-write"}
+            settings: ServeOptions = {"bind": "127.0.0.1:0", "access": "read-write"}
             settings.update(options)
             return running.enter_context(holdfast.Server(units, **settings))
 
@@ -163,7 +163,7 @@ def client(server: holdfast.Server, connect: Connect) -> wire.Connection:
 def server_process() -> Iterator[Process]:
     with ExitStack() as running:
 
-        def start(**options: Unpack[ServerOptions]) -> ServerProcess:
+        def start(**options: Unpack[ServeOptions]) -> ServerProcess:
             process = ServerProcess(**options)
             running.callback(process.stop)
             return process

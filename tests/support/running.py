@@ -8,9 +8,10 @@ import os
 import signal
 import subprocess
 import sys
-from typing import TYPE_CHECKING, Literal, Protocol, TypedDict
+from typing import TYPE_CHECKING, Protocol, TypedDict
 
 import holdfast
+from holdfast.server import ServerOptions
 from holdfast.types import AREAS
 from support import wire
 
@@ -23,21 +24,14 @@ if TYPE_CHECKING:
     from holdfast.types import Access, Area
 
 
-class ServerOptions(TypedDict, total=False):
-    """The options of `holdfast.Server`, except units."""
+class ServeOptions(ServerOptions, total=False):
+    """The arguments of `holdfast.Server`, except units."""
 
     bind: str
     access: Access
     sources: Sequence[str]
     functions: Collection[int]
     deny: Collection[int]
-    max_connections: int
-    max_connections_per_source: int
-    when_full: Literal["refuse", "evict"]
-    idle_timeout: float
-    request_timeout: float
-    keepalive: int
-    listen_only: bool
     workers: int
     identity: Identity
 
@@ -68,7 +62,7 @@ class Serve(Protocol):
     """Starts a server that is stopped when the test ends."""
 
     def __call__(
-        self, units: Mapping[int, holdfast.Memory], **options: Unpack[ServerOptions]
+        self, units: Mapping[int, holdfast.Memory], **options: Unpack[ServeOptions]
     ) -> holdfast.Server: ...
 
 
@@ -83,7 +77,7 @@ class Connect(Protocol):
 class ServerProcess:
     """A server in its own process, with its own file descriptors and memory."""
 
-    def __init__(self, **options: Unpack[ServerOptions]) -> None:
+    def __init__(self, **options: Unpack[ServeOptions]) -> None:
         settings = {"bind": "127.0.0.1:0", "access": "read-write"} | options
         self._process = subprocess.Popen(
             [sys.executable, "-c", SERVE_UNTIL_STDIN_ENDS, json.dumps(settings)],
@@ -122,7 +116,7 @@ class ServerProcess:
 class Process(Protocol):
     """Starts a server process that is stopped when the test ends."""
 
-    def __call__(self, **options: Unpack[ServerOptions]) -> ServerProcess: ...
+    def __call__(self, **options: Unpack[ServeOptions]) -> ServerProcess: ...
 
 
 class Run(Protocol):
