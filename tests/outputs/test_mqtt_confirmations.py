@@ -154,7 +154,7 @@ def made(broker: Broker | FakeBroker, site: Site, stop: Stop, **more: Any) -> Mq
     url = broker.url if isinstance(broker, FakeBroker) else f"mqtt://127.0.0.1:{broker.port}"
     settings = MqttOutputConfig.model_validate({"type": "mqtt", "url": url} | more)
     output = MqttOutput("home", settings, site)
-    output.until(stop)
+    output.use_stop(stop)
     return output
 
 

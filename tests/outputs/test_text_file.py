@@ -14,7 +14,7 @@ import pytest
 
 from holdfast.config.models.outputs import FileConfig
 from holdfast.outputs import text_file
-from holdfast.outputs.sqlite_file import Database
+from holdfast.outputs.sqlite_file import SqliteFile
 from holdfast.outputs.text_file import HEAD, TextFile
 from support.line_protocol import parsed
 from support.readings import numbered, reading, tag
@@ -303,7 +303,7 @@ def test_a_folder_that_is_missing_is_an_error(tmp_path: Path) -> None:
 
 
 def test_a_database_has_one_row_for_each_value(tmp_path: Path) -> None:
-    database = Database(settings(tmp_path / "a.db", "sqlite"))
+    database = SqliteFile(settings(tmp_path / "a.db", "sqlite"))
     database.send(READINGS)
     database.send([reading(2**64 - 1)])
     assert database._db is not None
@@ -321,7 +321,7 @@ def test_a_database_has_one_row_for_each_value(tmp_path: Path) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no open database")
 @pytest.mark.parametrize("removed", ["a.db", "a.db*"])
 def test_a_database_that_is_removed_is_made_again(tmp_path: Path, removed: str) -> None:
-    database = Database(settings(tmp_path / "a.db", "sqlite"))
+    database = SqliteFile(settings(tmp_path / "a.db", "sqlite"))
     database.send(READINGS[:1])
     for file in tmp_path.glob(removed):
         file.unlink()
@@ -332,7 +332,7 @@ def test_a_database_that_is_removed_is_made_again(tmp_path: Path, removed: str) 
 
 
 def test_old_rows_go_when_a_database_is_too_large(tmp_path: Path) -> None:
-    database = Database(settings(tmp_path / "a.db", "sqlite", max_bytes=2**20))
+    database = SqliteFile(settings(tmp_path / "a.db", "sqlite", max_bytes=2**20))
     for start in range(0, 40_000, 5000):
         database.send([reading(number, 1.7e9 + number) for number in range(start, start + 5000)])
     assert database._db is not None
@@ -345,7 +345,7 @@ def test_old_rows_go_when_a_database_is_too_large(tmp_path: Path) -> None:
 
 
 def test_a_small_database_is_never_emptied(tmp_path: Path) -> None:
-    database = Database(settings(tmp_path / "a.db", "sqlite", max_bytes=65536))
+    database = SqliteFile(settings(tmp_path / "a.db", "sqlite", max_bytes=65536))
     counts = []
     for start in range(0, 2000, 100):
         database.send(numbered(100, start))
@@ -359,7 +359,7 @@ def test_a_small_database_is_never_emptied(tmp_path: Path) -> None:
 
 
 def test_rows_are_stored_once_if_old_ones_can_not_be_removed(tmp_path: Path) -> None:
-    database = Database(settings(tmp_path / "a.db", "sqlite", max_bytes=2**20))
+    database = SqliteFile(settings(tmp_path / "a.db", "sqlite", max_bytes=2**20))
     database.send(numbered(10_000))
     assert database._db is not None
     answers = {True: sqlite3.SQLITE_DENY, False: sqlite3.SQLITE_OK}
@@ -374,7 +374,7 @@ def test_rows_are_stored_once_if_old_ones_can_not_be_removed(tmp_path: Path) -> 
 
 
 def test_rows_of_a_clock_that_was_in_the_future_go_first(tmp_path: Path) -> None:
-    database = Database(settings(tmp_path / "a.db", "sqlite", max_bytes=2**20))
+    database = SqliteFile(settings(tmp_path / "a.db", "sqlite", max_bytes=2**20))
     for start in (2.0e9, 1.7e9):
         for at in range(0, 20_000, 5000):
             database.send([reading(at, start + number) for number in range(at, at + 5000)])
@@ -387,7 +387,7 @@ def test_rows_of_a_clock_that_was_in_the_future_go_first(tmp_path: Path) -> None
 def test_a_database_that_is_broken_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "a.db").write_bytes(b"no database" * 1000)
     with pytest.raises(OSError, match=r"a\.db: file is not a database"):
-        Database(settings(tmp_path / "a.db", "sqlite")).send(READINGS)
+        SqliteFile(settings(tmp_path / "a.db", "sqlite")).send(READINGS)
 
 
 def test_a_database_whose_damaged_schema_is_not_utf_8_is_an_error(tmp_path: Path) -> None:
@@ -396,4 +396,4 @@ def test_a_database_whose_damaged_schema_is_not_utf_8_is_an_error(tmp_path: Path
         db.execute("CREATE TABLE readings (time)")
     file.write_bytes(file.read_bytes().replace(b"tablereadings", b"table\x9feadings"))
     with pytest.raises(OSError, match=r"a\.db: malformed"):
-        Database(settings(file, "sqlite")).send(READINGS)
+        SqliteFile(settings(file, "sqlite")).send(READINGS)

@@ -115,9 +115,9 @@ class Appliance:
         `UnknownAdapter`; nothing has changed then. Raises `ReloadIncomplete` for an internal error
         after the listeners have changed. Call it in the thread that calls `log_events`.
         """
-        changed = self._parts().reload(config)
+        changed = self._require_running().reload(config)
         self.config = config
-        self._parts().log_listening()
+        self._require_running().log_listening()
         return changed
 
     @property
@@ -128,40 +128,40 @@ class Appliance:
     @property
     def health(self) -> Health:
         """Whether it is live and ready. Raises `RuntimeError` if not running."""
-        return self._parts().health
+        return self._require_running().health
 
     @property
     def diagnostics(self) -> Diagnostics:
         """The diagnostics. Raises `RuntimeError` if not running."""
-        return self._parts().diagnostics
+        return self._require_running().diagnostics
 
     def endpoints(self) -> list[ListenAddress]:
         """Returns the addresses of all listeners and services, in configuration order."""
-        return self._parts().endpoints()
+        return self._require_running().endpoints()
 
     def log_events(self, timeout: float) -> None:
         """Waits up to `timeout` seconds for a listener event and logs it.
 
         Also logs changes of seals and of the health of devices, and threads that are stalled.
         """
-        self._parts().log_events(timeout)
+        self._require_running().log_events(timeout)
 
     def sessions(self) -> list[dict[str, Any]]:
         """The open connections of all listeners. Thread-safe."""
-        return self._parts().listeners.engine.sessions()
+        return self._require_running().listeners.engine.sessions()
 
     def replicas(self) -> dict[str, dict[str, Any]]:
         """The state of each log that memories are replicated through. Thread-safe."""
-        return dict(self._parts().leases.stats()["logs"])
+        return dict(self._require_running().leases.stats()["logs"])
 
     def end_session(self, listener: str, number: int, by: Mapping[str, str]) -> bool:
         """Ends a connection. Returns whether there was one. Thread-safe.
 
         `by` is who has requested it, as fields of the audit log.
         """
-        return self._parts().listeners.end_session(listener, number, by)
+        return self._require_running().listeners.end_session(listener, number, by)
 
-    def _parts(self) -> _Running:
+    def _require_running(self) -> _Running:
         if self._running is None:
             raise RuntimeError("the appliance is not running")
         return self._running
@@ -247,7 +247,7 @@ class _Running:
                 part.open(plan)
             for part in self._parts:
                 part.start()
-            undo.pop_all()
+            undo.pop_all()  # All have started: nothing is closed.
 
     def stop(self) -> None:
         """Requests the stop of all parts, then waits for each."""
@@ -271,7 +271,7 @@ class _Running:
         with ExitStack() as undo:
             plan = Plan(config, changed, dict(self.memories.by_name), undo)
             prepared = [part.prepare(plan) for part in self._parts]
-            undo.pop_all()
+            undo.pop_all()  # All are prepared: what they have opened is kept.
         self._config, self._fingerprints = config, now
         for part in self._parts:
             part.config = config

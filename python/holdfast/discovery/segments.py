@@ -29,7 +29,7 @@ from holdfast.discovery.byte_order_habits import (
     PREFERENCES,
     Habit,
 )
-from holdfast.discovery.type_rarity import NARROW, RARE, SIZES, rarity
+from holdfast.discovery.type_rarity import NARROW, RARITY_BITS, SIZES, rarity
 from holdfast.values import ConversionError
 
 if TYPE_CHECKING:
@@ -508,7 +508,8 @@ def _texts(reads: Sequence[Sequence[int]], at: int, order: str, is_open: bool) -
         kind = PART if field.goes_on else f"string:{field.length}"
         text = f"string:{field.length}"
         found = tuple(values.decode(part[:registers], text, order) for part in parts)
-        bits = field.bits + LATER * (len(reads) - 1) + (RARE["string"] if field.goes_on else 0)
+        bits = field.bits + LATER * (len(reads) - 1)
+        bits += RARITY_BITS["string"] if field.goes_on else 0
         reasons = ["printable text"]
         if _changes(found):
             bits += _changes(found) * field.bits

@@ -12,7 +12,7 @@ from holdfast.values.orders import SWAPPED_BYTES
 if TYPE_CHECKING:
     from holdfast.discovery.byte_order_habits import Habit
 
-RARE = {
+RARITY_BITS = {
     "uint16": 1.0,
     "int16": 0.9,
     "float32": 5.3,
@@ -28,7 +28,7 @@ RARE = {
 }
 """How rare a type is among the values of devices, in bits."""
 
-SIZES = {kind: values.register_count(kind) for kind in RARE if kind != "string"}
+SIZES = {kind: values.register_count(kind) for kind in RARITY_BITS if kind != "string"}
 """The registers of a value of each type."""
 
 NARROW = {kind for kind, size in SIZES.items() if size == 1}
@@ -36,17 +36,17 @@ NARROW = {kind for kind, size in SIZES.items() if size == 1}
 
 SWAPPED_TEXT = {True: 1.0, False: 5.5}
 """How rare swapped bytes in text are, in bits, on a device that swaps those of numbers and on
-others. The former leaves the text as it is as often.
+others. Devices that swap the bytes of numbers leave text unswapped equally often.
 """
 
 
 @cache
 def rarity(kind: str, order: str, habit: Habit) -> float:
     """How rare a type and its order are in a device with this habit, in bits."""
-    rare = RARE[kind] + PREFERRED[habit.prefers].get(kind, 0.0)
+    bits = RARITY_BITS[kind] + PREFERRED[habit.prefers].get(kind, 0.0)
     if kind == "string":
         swaps = habit.order in SWAPPED_BYTES
-        return rare + (SWAPPED_TEXT[swaps] if swaps or order == "BADC" else 0)
+        return bits + (SWAPPED_TEXT[swaps] if swaps or order == "BADC" else 0)
     if kind in NARROW:
-        return rare
-    return rare + (MIXED if order != habit.order else 0)
+        return bits
+    return bits + (MIXED if order != habit.order else 0)

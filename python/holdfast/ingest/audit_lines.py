@@ -43,19 +43,19 @@ class Recording:
         self._writes = writes
         self._group: Group | None = None
 
-    def begin(self) -> None:
+    def checked(self) -> None:
         """The commands were checked. Raises `Unrecorded`."""
         if self._writes.can_be_refused:
             self._audit.require()
         else:
             self._group = self._audit.queue(self._lines("done"))
 
-    def write(self) -> None:
+    def before_write(self) -> None:
         """The commands are about to be carried out. Raises `Unrecorded`."""
         if self._group is not None:
             self._audit.write_group(self._group)
 
-    def done(self, sequence: int | None = None) -> None:
+    def carried_out(self, sequence: int | None = None) -> None:
         """The commands were carried out, in the step of a log with this number."""
         if self._group is None:
             self._audit.write_all(self._lines("done", sequence))
@@ -64,7 +64,7 @@ class Recording:
         """Nobody knows whether the commands will be carried out."""
         self._audit.write_all(self._lines("not_confirmed"))
 
-    def answered(self, device: str, code: int | None) -> None:
+    def answered_by_device(self, device: str, code: int | None) -> None:
         """A device was sent the commands in place of memory, and answered with this exception, if
         any. The outcome is named as that of the same write over Modbus.
         """

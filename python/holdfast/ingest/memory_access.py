@@ -218,7 +218,7 @@ class MemoryAccess:
         """Takes the answer of the device: the code of its exception, if any. Raises `Refused`."""
         assert begun.device is not None
         if begun.recording is not None:
-            begun.recording.answered(begun.device, code)
+            begun.recording.answered_by_device(begun.device, code)
         if code is None:
             return self._accepted(begun, len(values_of(begun.batch[0])))
         name = EXCEPTIONS.get(code, "unknown")
@@ -396,7 +396,7 @@ class MemoryAccess:
                 begun.recording = Recording(self._audit, origin, memories, begun.writes)
             begun.writes.check()
             if begun.recording is not None:
-                begun.recording.begin()
+                begun.recording.checked()
         except Unrecorded:
             raise unrecorded(begun.where) from None
         except _core.BatchRefused as refused:
@@ -414,7 +414,7 @@ class MemoryAccess:
         assert begun.writes is not None
         try:
             if begun.recording is not None:
-                begun.recording.write()
+                begun.recording.before_write()
             outcome: _Outcome = begun.writes.write()
         except Unrecorded:
             raise unrecorded(begun.where) from None
@@ -429,7 +429,7 @@ class MemoryAccess:
             return 0
         values, sequence = outcome
         if begun.recording is not None:
-            begun.recording.done(sequence)
+            begun.recording.carried_out(sequence)
         return values
 
     def _device(self, begun: Begun, refused: _core.BatchRefused) -> str:

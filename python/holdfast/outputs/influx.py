@@ -68,7 +68,7 @@ class Influx(Receiver):
             given = {key: value for key, value in query.items() if value is not None}
             self._path = f"/api/v2/write?{urlencode(given)}"
 
-    def until(self, stop: Stop) -> None:
+    def use_stop(self, stop: Stop) -> None:
         """Ends a request that waits for its answer soon after the stop. Called before all else."""
         soon_after(stop, self._end)
 

@@ -55,8 +55,8 @@ class Refused(Exception):
 class Receiver(Protocol):
     """Where the readings of an output go. For the thread of the output."""
 
-    def until(self, _stop: Stop, /) -> None:
-        """Takes the stop of the output, to end waits with it. Called before all else."""
+    def use_stop(self, _stop: Stop, /) -> None:
+        """Takes the stop of the output, which ends waits early. Called before all else."""
         return
 
     def send(self, readings: list[Reading]) -> None:
@@ -120,9 +120,9 @@ class Sending:
         receiver: Receiver,
         buffer: Buffer,
         open_file: Callable[[], Stored] | None = None,
-        leaves_file: Callable[[], bool] = bool,
-        is_followed: Callable[[], bool] = bool,
-        renew: Callable[[Collection[tuple[str, str]] | None], object] = bool,
+        leaves_file: Callable[[], bool] = lambda: False,
+        is_followed: Callable[[], bool] = lambda: False,
+        renew: Callable[[Collection[tuple[str, str]] | None], object] = lambda _: None,
     ) -> None:
         self._name, self._receiver, self._buffer = name, receiver, buffer
         self._open_file, self._renew = open_file, renew
@@ -159,7 +159,7 @@ class Sending:
 
     def _run(self, stop: Stop) -> None:
         stop.then(self._buffer.wake)
-        self._receiver.until(stop)
+        self._receiver.use_stop(stop)
         try:
             while not stop.is_set():
                 self._use_file()
@@ -206,7 +206,7 @@ class Sending:
             self._failed(error)
             return False
         self._worked(len(self._buffer) - len(readings))
-        self._done()
+        self._confirm_sent()
         return True
 
     def _take(self, seconds: float) -> list[Reading]:
@@ -215,7 +215,7 @@ class Sending:
             return self._buffer.take(MAX_READINGS, seconds)
         return self._buffer.take(MAX_READINGS, seconds)
 
-    def _done(self) -> None:
+    def _confirm_sent(self) -> None:
         """Removes what was sent. If the file fails, the next readings are sent all the same."""
         with self._using_file():
             if self._buffer.done():
@@ -282,7 +282,7 @@ class Sending:
                     self._send(self._take(0.0))
                 except OSError:
                     break
-                self._done()
+                self._confirm_sent()
         self._keep(STORE_TIMEOUT_S)
         self._log_dropped(0.0)
         self._log_unsent()

@@ -29,7 +29,7 @@ MAX_ROWS_PER_REMOVAL = 1000
 """Limit of rows that are removed at once if the database is too large; of few, it is a tenth."""
 
 
-class Database(Receiver):
+class SqliteFile(Receiver):
     """The table `readings`. Others may read it meanwhile."""
 
     def __init__(self, settings: FileConfig) -> None:

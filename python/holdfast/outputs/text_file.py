@@ -102,7 +102,7 @@ def _is_same(file: io.FileIO, path: Path) -> bool:
 
 
 class Form(NamedTuple):
-    """What a file of an output has, how it is known, and what of its end is whole."""
+    """The format of a text file: how rows are encoded, and how a row that was cut off is found."""
 
     encode: Callable[[list[Reading]], bytes]
     """The rows of readings."""

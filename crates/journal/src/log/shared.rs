@@ -43,14 +43,14 @@ pub(super) struct Shared {
     max_step_bytes: AtomicUsize,
     stopping: AtomicBool,
     queue: Mutex<Queue>,
-    pub(super) arrived: Notify,
+    pub(super) step_arrived: Notify,
     pub(super) counters: Counters,
     progress: Mutex<Progress>,
-    changed: Condvar,
+    progress_changed: Condvar,
     /// Held by the caller that requests a checkpoint: an answer is for one only.
     requesting: Mutex<()>,
     exchange: Mutex<Exchange>,
-    answered: Condvar,
+    checkpoint_answered: Condvar,
 }
 
 /// The contents of the memories after one message, in the order of their names, and a note about them.
@@ -71,7 +71,7 @@ enum Exchange {
 
 #[derive(Default)]
 struct Queue {
-    open: bool,
+    is_open: bool,
     steps: VecDeque<Waiting>,
     bytes: usize,
 }
@@ -108,8 +108,8 @@ impl Journal for Shared {
         let mut queue = lock(&self.queue);
         let fits =
             queue.steps.len() < MAX_QUEUE_STEPS && queue.bytes + bytes.len() <= MAX_QUEUE_BYTES;
-        if !queue.open || !fits {
-            let refusal = if queue.open { Refusal::Busy } else { Refusal::Unavailable };
+        if !queue.is_open || !fits {
+            let refusal = if queue.is_open { Refusal::Busy } else { Refusal::Unavailable };
             drop(queue);
             self.counters.unavailable.add();
             return refuse(done, refusal);
@@ -118,7 +118,7 @@ impl Journal for Shared {
         let until = Instant::now() + self.write_timeout;
         queue.steps.push_back(Waiting { bytes, done, until });
         drop(queue);
-        self.arrived.notify_one();
+        self.step_arrived.notify_one();
     }
 
     fn guards(&self) -> bool {
@@ -147,13 +147,13 @@ impl Shared {
             max_step_bytes: AtomicUsize::new(usize::MAX),
             stopping: AtomicBool::new(false),
             queue: Mutex::default(),
-            arrived: Notify::new(),
+            step_arrived: Notify::new(),
             counters: Counters::default(),
             progress: Mutex::default(),
-            changed: Condvar::new(),
+            progress_changed: Condvar::new(),
             requesting: Mutex::default(),
             exchange: Mutex::default(),
-            answered: Condvar::new(),
+            checkpoint_answered: Condvar::new(),
         }
     }
 
@@ -188,13 +188,13 @@ impl Shared {
     /// Takes steps from now on.
     pub(super) fn open(&self, max_step_bytes: usize) {
         self.max_step_bytes.store(max_step_bytes, Ordering::Relaxed);
-        lock(&self.queue).open = !self.is_stopping();
+        lock(&self.queue).is_open = !self.is_stopping();
     }
 
     /// Refuses steps from now on, and those that were not sent.
     pub(super) fn close(&self) {
         let mut queue = lock(&self.queue);
-        queue.open = false;
+        queue.is_open = false;
         queue.bytes = 0;
         let steps = std::mem::take(&mut queue.steps);
         drop(queue);
@@ -243,7 +243,7 @@ impl Shared {
     pub(super) fn stop(&self) {
         self.stopping.store(true, Ordering::Release);
         self.close();
-        self.arrived.notify_one();
+        self.step_arrived.notify_one();
     }
 
     pub(super) fn is_stopping(&self) -> bool {
@@ -290,7 +290,7 @@ impl Shared {
             *exchange = Exchange::Requested;
         }
         let is_open = |exchange: &mut Exchange| matches!(exchange, Exchange::Requested);
-        let waited = self.answered.wait_timeout_while(exchange, timeout, is_open);
+        let waited = self.checkpoint_answered.wait_timeout_while(exchange, timeout, is_open);
         let mut exchange = waited.unwrap_or_else(PoisonError::into_inner).0;
         if let Exchange::Ended(last) = &*exchange {
             return last.clone();
@@ -317,7 +317,7 @@ impl Shared {
 
     fn answer(&self, answer: Exchange) {
         *lock(&self.exchange) = answer;
-        self.answered.notify_all();
+        self.checkpoint_answered.notify_all();
     }
 
     pub(super) fn event(&self, event: Event) {
@@ -327,12 +327,12 @@ impl Shared {
         }
         progress.events.push_back(event);
         drop(progress);
-        self.changed.notify_all();
+        self.progress_changed.notify_all();
     }
 
     pub(super) fn update(&self, change: impl FnOnce(&mut View)) {
         change(&mut lock(&self.progress).view);
-        self.changed.notify_all();
+        self.progress_changed.notify_all();
     }
 
     /// Changes what is known of a node. No call waits for that, so none is woken.
@@ -351,8 +351,9 @@ impl Shared {
     /// Waits until the view is as wanted, at most for this time. Returns it.
     pub(super) fn wait(&self, timeout: Duration, wanted: impl Fn(&View) -> bool) -> View {
         let progress = lock(&self.progress);
-        let waited =
-            self.changed.wait_timeout_while(progress, timeout, |progress| !wanted(&progress.view));
+        let waited = self
+            .progress_changed
+            .wait_timeout_while(progress, timeout, |progress| !wanted(&progress.view));
         waited.unwrap_or_else(PoisonError::into_inner).0.view.clone()
     }
 
@@ -360,7 +361,7 @@ impl Shared {
     pub(super) fn take_events(&self, timeout: Duration) -> Vec<Event> {
         let progress = lock(&self.progress);
         let waited = self
-            .changed
+            .progress_changed
             .wait_timeout_while(progress, timeout, |progress| progress.events.is_empty());
         let mut progress = waited.unwrap_or_else(PoisonError::into_inner).0;
         progress.events.drain(..).collect()

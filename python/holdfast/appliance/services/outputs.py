@@ -130,9 +130,9 @@ def receiver(name: str, settings: Output, site: Site) -> Receiver:
 
             return SparkplugOutput(name, settings, site)
         case FileConfig(format="sqlite"):
-            from holdfast.outputs.sqlite_file import Database
+            from holdfast.outputs.sqlite_file import SqliteFile
 
-            return Database(settings)
+            return SqliteFile(settings)
         case FileConfig():
             from holdfast.outputs.text_file import TextFile
 

@@ -56,7 +56,7 @@ class BrokerReceiver(Receiver):
         """The revision of the tags that were published."""
         self._connects = self._not_accepted = 0
 
-    def until(self, stop: Stop) -> None:
+    def use_stop(self, stop: Stop) -> None:
         """Takes the stop that ends all waiting. Called before all else."""
         self._stop = stop
 

@@ -56,7 +56,7 @@ class NatsOutput(Receiver):
         self._forbidden: list[Exception] = []
         """The error of each message that the server forbade, since the last step began."""
 
-    def until(self, stop: Stop) -> None:
+    def use_stop(self, stop: Stop) -> None:
         """Ends a wait for the server soon after the stop. Called before all else."""
         soon_after(stop, self._end)
 

@@ -160,7 +160,7 @@ impl<'n> Session<'n> {
                         self.node.snapshotter.make_room(&self.background);
                     }
                 }
-                () = self.node.shared.arrived.notified() => self.send_waiting().await?,
+                () = self.node.shared.step_arrived.notified() => self.send_waiting().await?,
                 entry = watch.next() => match entry {
                     Some(Ok(entry)) => self.watched(&entry)?,
                     Some(Err(error)) => return Err(End::lost("watching the keys of the log", error)),
