@@ -523,7 +523,7 @@ def test_an_answer_that_the_server_does_not_take_is_an_error() -> None:
         wire, outbox = Wire(), Outbox()
         wire.max_payload = 100
         outbox.connected(cast("SafeClient", wire))
-        responder = Responder(10, outbox)
+        responder = Responder("modbus", 10, outbox)
 
         async def handle(message: Msg) -> bytes:
             return b"1" * len(message.data)
@@ -537,6 +537,33 @@ def test_an_answer_that_the_server_does_not_take_is_an_error() -> None:
     error = b'{"success":false,"error":"the answer is too large: 101 bytes, the server takes 100"}'
     texts = [batch.text("r", b"1" * 100), batch.text("r", error)]
     assert asyncio.run(answered()) == texts
+
+
+@pytest.mark.parametrize(
+    "reply", ["modbus.shutdown", "modbus.command.d.t", "$KV.holdfast_scanner.modbus.d", "$JS.A"]
+)
+def test_a_request_is_not_answered_on_a_subject_of_scanners_or_of_nats(
+    caplog: pytest.LogCaptureFixture, reply: str
+) -> None:
+    """Its sender may have no right to publish to that subject."""
+
+    async def sent() -> list[bytes]:
+        wire, outbox = Wire(), Outbox()
+        outbox.connected(cast("SafeClient", wire))
+        responder = Responder("modbus", 10, outbox)
+
+        async def handle(_: Msg) -> bytes:
+            return b"1"
+
+        for subject in (reply, "modbus-hmi.inbox"):
+            message = Msg(cast("Client", wire), "modbus.browse", reply=subject)
+            await responder.answering("browse", handle)(message)
+        await responder.finish(DEADLINE)
+        return wire.sent
+
+    assert asyncio.run(sent()) == [batch.text("modbus-hmi.inbox", b"1")]
+    reason = f"no answer to {reply}: a reply subject can't begin with modbus. or $"
+    assert logged(caplog, "message_malformed") == [{"subject": "modbus.browse", "reason": reason}]
 
 
 def test_all_devices_are_browsed_beside_a_large_report_of_the_service() -> None:
@@ -717,7 +744,7 @@ def test_requests_do_not_wait_for_ever_until_the_scanner_is_ready(
         async def handle(_: Msg) -> Answer:
             return Answer(success=True)
 
-        waiting = responder.Responder(10, Answers(), asyncio.Event().wait)
+        waiting = responder.Responder("modbus", 10, Answers(), asyncio.Event().wait)
         message = Msg(cast("Client", None), "modbus.browse", reply="_INBOX.1", data=b"{}")
         await waiting.answering(kind, handle)(message)
         await has_answered.wait()
@@ -739,7 +766,7 @@ def test_requests_that_wait_until_the_scanner_is_ready_stay_in_order() -> None:
                 done.set()
             return Answer(success=True)
 
-        waiting = responder.Responder(10, cast("Outbox", None), ready.wait)
+        waiting = responder.Responder("modbus", 10, cast("Outbox", None), ready.wait)
         begin = waiting.answering("command", handle)
         for name in ("first", "second", "third"):
             await begin(Msg(cast("Client", None), name))

@@ -420,6 +420,16 @@ def test_the_rights_of_the_documentation_are_enough(
     assert reasons(caplog, "nats_error") == []
 
 
+def test_a_reply_subject_does_not_stop_a_scanner(
+    run_scanner: Run, caller: Caller, caplog: pytest.LogCaptureFixture
+) -> None:
+    scanner = run_scanner(prefix="plant.a")
+    caller.publish("plant.a.browse", reply="plant.a.shutdown")
+    until_logged(caplog, "message_malformed", "no answer to plant.a.shutdown")
+    assert caller.request("plant.a.browse", b"")["success"]
+    assert scanner.serves
+
+
 def damaged(seed: str) -> str:
     return seed[:20] + ("A" if seed[20] != "A" else "B") + seed[21:]
 

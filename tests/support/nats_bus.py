@@ -136,12 +136,12 @@ class Caller:
         message = self._loop.do(self.client.request(subject, _bytes(payload), timeout=seconds))
         return json.loads(message.data)
 
-    def publish(self, subject: str, payload: object = b"") -> None:
+    def publish(self, subject: str, payload: object = b"", reply: str = "") -> None:
         """Publishes a message and waits until the server has it."""
-        self._loop.do(self._published(subject, _bytes(payload)))
+        self._loop.do(self._published(subject, _bytes(payload), reply))
 
-    async def _published(self, subject: str, payload: bytes) -> None:
-        await self.client.publish(subject, payload)
+    async def _published(self, subject: str, payload: bytes, reply: str) -> None:
+        await self.client.publish(subject, payload, reply)
         await self.client.flush()
 
     def listen(self, subject: str) -> Inbox:

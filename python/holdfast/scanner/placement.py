@@ -38,7 +38,7 @@ if TYPE_CHECKING:
         UnsubscribeRequest,
         Variable,
     )
-    from holdfast.scanner.responder import Handle
+    from holdfast.scanner.responder import Responder
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.key import SubscriptionKey
     from holdfast.scanner.subscriptions.subscription import Subscription
@@ -282,7 +282,7 @@ class Placement:
         self,
         _commands: CommandHost,
         _reports: ReportHost,
-        _answering: Callable[[str, Handle], Handler],
+        _responder: Responder,
         _end: Callable[[], None],
         /,
     ) -> Mapping[str, Handler]:

@@ -40,9 +40,15 @@ class Responder:
     """Runs requests as tasks, up to a limit."""
 
     def __init__(
-        self, max_pending: int, outbox: Outbox, *until_ready: Callable[[], Awaitable[object]]
+        self,
+        prefix: str,
+        max_pending: int,
+        outbox: Outbox,
+        *until_ready: Callable[[], Awaitable[object]],
     ) -> None:
-        """Requests wait for each of `until_ready`."""
+        """`prefix` is that of the scanner's subjects. Requests wait for each of `until_ready`."""
+        self._not_answered = (f"{prefix}.", "$")
+        """How subjects begin that an answer would be a request on: to a scanner, or to NATS."""
         self._max_pending = max_pending
         self._outbox = outbox
         self._until_ready = until_ready
@@ -57,22 +63,37 @@ class Responder:
         """Returns a handler that carries out messages concurrently and answers them."""
 
         async def carry_out(message: Msg) -> None:
-            answer = await self._answer(kind, handle, message)
-            if message.reply:
-                payload = answer if isinstance(answer, bytes) else msgspec.json.encode(answer)
-                if len(payload) > self._outbox.max_payload:
-                    # The server would end the connection, at each repetition of the request.
-                    size = f"{len(payload)} bytes, the server takes {self._outbox.max_payload}"
-                    error = Answer(success=False, error=f"the answer is too large: {size}")
-                    payload = msgspec.json.encode(error)
-                await self._outbox.answer(message.reply, payload)
+            await self.answer(message, await self._carry_out(kind, handle, message))
 
         async def begin(message: Msg) -> None:
             self.begin(carry_out(message))
 
         return begin
 
-    async def _answer(
+    async def answer(self, message: Msg, answer: Answer | BrowseAnswer | bytes) -> None:
+        """Answers a message that has a reply subject.
+
+        Its sender has chosen that subject, and may have no right to publish to it: there is no
+        answer to a subject of scanners or of NATS.
+        """
+        if not message.reply:
+            return
+        if message.reply.startswith(self._not_answered):
+            refused = " or ".join(self._not_answered)
+            reason = f"no answer to {message.reply}: a reply subject can't begin with {refused}"
+            log_lines.refused(
+                "message_malformed", kind="reply", subject=message.subject, reason=reason
+            )
+            return
+        payload = answer if isinstance(answer, bytes) else msgspec.json.encode(answer)
+        if len(payload) > self._outbox.max_payload:
+            # The server would end the connection, at each repetition of the request.
+            size = f"{len(payload)} bytes, the server takes {self._outbox.max_payload}"
+            error = Answer(success=False, error=f"the answer is too large: {size}")
+            payload = msgspec.json.encode(error)
+        await self._outbox.answer(message.reply, payload)
+
+    async def _carry_out(
         self, kind: str, handle: Handle, message: Msg
     ) -> Answer | BrowseAnswer | bytes:
         try:

@@ -91,7 +91,7 @@ class Scanner:
             settings.exact_pauses_s or dialect.reconnect_pauses_s,
         )
         self._responder = Responder(
-            settings.limits.pending, self.outbox, self._ready.wait, self._buckets.read
+            prefix, settings.limits.pending, self.outbox, self._ready.wait, self._buckets.read
         )
         self._allowed = AllowedDevices(settings.allow, settings.device_tls, poller)
         self._devices = Devices(
@@ -296,8 +296,8 @@ class Scanner:
             f"{prefix}.browse": answering("browse", reports.browse),
             f"{prefix}.variables": answering("variables", reports.variables),
         }
-        of_nodes = self._placement.handlers(self._commands, self._reports, answering, self.end)
-        return {**handlers, **of_nodes}
+        more = self._placement.handlers(self._commands, self._reports, self._responder, self.end)
+        return {**handlers, **more}
 
     async def _stop(self, running: Sequence[asyncio.Task[object]]) -> None:
         """Stops all parts, each with a timeout."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from holdfast import _core
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import Broker
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
         ReportHandlers,
         ReportHost,
     )
-    from holdfast.scanner.responder import Handle
+    from holdfast.scanner.responder import Responder
     from holdfast.scanner.settings import FleetSettings, Settings
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
@@ -64,12 +62,11 @@ class FleetPlacement(FleetMember):
 
     def outbox(self, repeat_values: Callable[[], None], /) -> Outbox:
         """Returns a queue that sends nothing while other nodes may poll the same devices."""
-        self._outbox = Outbox(
+        return Outbox(
             may_send=lambda: not self.is_joined or self.fleet.may_publish,
             on_drop=repeat_values,
             at_once=True,
         )
-        return self._outbox
 
     async def write(
         self,
@@ -110,7 +107,7 @@ class FleetPlacement(FleetMember):
         self,
         commands: CommandHost,
         reports: ReportHost,
-        answering: Callable[[str, Handle], Handler],
+        responder: Responder,
         end: Callable[[], None],
         /,
     ) -> Mapping[str, Handler]:
@@ -118,7 +115,7 @@ class FleetPlacement(FleetMember):
         node, process = self.fleet.node, self.fleet.leases.process
         answers = NodeAnswers(self, self._registry, commands, reports)
         handlers = {
-            subject(self._prefix, node, what, process): answering(what, handle)
+            subject(self._prefix, node, what, process): responder.answering(what, handle)
             for what, handle in (
                 ("command", answers.command),
                 ("browse", answers.browse),
@@ -129,9 +126,7 @@ class FleetPlacement(FleetMember):
         async def drain(message: Msg) -> None:
             """Hands all devices over to the other nodes, and ends."""
             log_lines.write(logging.INFO, "shutdown_asked")
-            if message.reply:
-                answer = msgspec.json.encode(Answer(success=True))
-                await self._outbox.answer(message.reply, answer)
+            await responder.answer(message, Answer(success=True))
             end()
 
         return {**handlers, subject(self._prefix, node, "drain"): drain}
