@@ -191,8 +191,8 @@ class FrameCounters(TypedDict):
     """Frames that are not requests.
 
     `foreign`: a protocol id other than 0. `broken`: an impossible length. `damaged`: a wrong
-    checksum or character. `other_unit`: on a serial line, a unit that is not served, or
-    an exception.
+    checksum or character. `other_unit`: on a serial line, a unit that is not served; there
+    and over UDP, an exception.
     """
 
     foreign: int

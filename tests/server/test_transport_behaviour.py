@@ -128,6 +128,8 @@ def test_a_pdu_is_answered_and_leaves_memory_as_its_vector_says(
         for case in cases("frames.json")
         # One vector is a reply. A request of its function is shorter, which matters in a stream.
         if kind != "rtu" or case["pdu"][:4] != "0306"
+        # One is an exception.
+        if kind != "rtu-udp" or case["pdu"][:2] < "80"
     ],
 )
 def test_a_frame_is_served_as_its_vector_spells_it(
@@ -139,6 +141,19 @@ def test_a_frame_is_served_as_its_vector_spells_it(
 
     [(unit, reply)] = client.replies(1)
     assert (unit, reply[0] & 0x7F) == (case["unit"], int(case["pdu"][:2], 16) & 0x7F)
+
+
+@over("udp", "rtu-udp")
+def test_an_exception_in_a_datagram_is_ignored(
+    transport: Transport, client: Peer, appliance: Appliance
+) -> None:
+    """Another server may have sent it, which would answer the answer, and so on without end."""
+    for pdu in (b"\x80", b"\x83\x01", b"\xff" + bytes(5)):
+        client.send(lines.rtu(pdu, 1) if transport.mode is lines.RTU else wire.frame(pdu))
+    assert client.ask(READ) == ZERO
+    assert client.is_quiet()
+    found = counters(appliance)
+    assert (found["frames"]["other_unit"], found["requests"]) == (3, {3: 1})
 
 
 @over("udp", "rtu-udp")

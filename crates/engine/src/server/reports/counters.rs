@@ -31,7 +31,7 @@ counters! {
         broken,
         /// Wrong CRC or LRC, incomplete, too long, or invalid characters: discarded.
         damaged,
-        /// On a serial line, for a unit that is not served here, or an exception: ignored.
+        /// On a serial line, for a unit that is not served here; there and over UDP, an exception: ignored.
         other_unit,
     }
 }

@@ -179,6 +179,12 @@ impl ModbusUdp {
             return 0;
         };
         let (tag, unit_id, request) = match D::only(datagram) {
+            // The exception of another server. After one request with a forged address, two servers would
+            // answer each other's exceptions without end.
+            Next::Request { pdu: [0x80..=0xFF, ..], .. } => {
+                self.unit_server.counters.frames.other_unit.add();
+                return 0;
+            }
             Next::Request { tag, unit_id, pdu, .. } => (tag, unit_id, pdu),
             Next::Foreign { .. } => {
                 self.unit_server.discard(|frames| &frames.foreign);
