@@ -27,6 +27,7 @@ from holdfast.scanner.subscriptions.request_rules import Rules, ScannerLimits
 from support import wire
 from support.brokers import NatsServer
 from support.nats_bus import SMALL_PAYLOAD, Caller, leaving, logged, subscription, tag
+from support.scanner_parts import store_of
 from support.tentacle import plc_subscribe, plc_tag, plc_unsubscribe
 
 if TYPE_CHECKING:
@@ -764,6 +765,25 @@ def test_what_is_remembered_without_jetstream_is_limited(monkeypatch: pytest.Mon
     for owner in owners:
         stored.unsubscribed(owner.removal())
     assert len([*stored.removals(())]) == 3
+
+
+def test_only_what_is_to_be_stored_waits_for_jetstream(
+    run_scanner: Run,
+    own_nats: NatsServer,
+    own_caller: Caller,
+    server: holdfast.Server,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(store, "MAX_RETRY_S", 0.1)
+    jetstream = own_nats.restarted()
+    request = subscription(server, tag("a", 0), host="127.0.0.2")
+    former = [msgspec.json.decode(json.dumps(request), type=SubscribeRequest)]
+    scanner = run_scanner(own_nats, former=former, allow=("127.0.0.1/32",))
+    assert own_caller.request("modbus.unsubscribe", leaving("a", deviceId="unknown"))["success"]
+    wire.until(lambda: not store_of(scanner.scanner).touched, "what nobody has is forgotten")
+    own_nats.restarted(*jetstream)
+    wanted = {("plc1", "hmi"): {"a"}}
+    wire.until(lambda: stored_tags(own_caller) == wanted, "what is refused is stored")
 
 
 def test_what_is_unsubscribed_without_jetstream_stays_so_after_a_reload(

@@ -158,6 +158,10 @@ def test_a_request_with_anything_wrong_is_refused_and_changes_nothing(
         assert caller.request("modbus.subscribe", text)["success"] is False
         refused = caller.request("modbus.unsubscribe", text)
         assert (refused["success"], "internal" in refused["error"]) == (False, False)
+    long = "x" * 257
+    for change in ({"deviceId": long[:129]}, {"subscriberId": long}, {"tagIds": [long]}):
+        refused = caller.request("modbus.unsubscribe", leaving("known") | change)
+        assert f"`str` of length <= {128 if 'deviceId' in change else 256}" in refused["error"]
     if strict:
         unknown = caller.request("modbus.unsubscribe", leaving("known", all=True))
         assert unknown == {"success": False, "error": "Object contains unknown field `all`"}

@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from holdfast.scanner.fleet.placement import FleetPlacement
+from holdfast.scanner.jetstream.restore import StoredSubscriptions
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.net.nats.connection import Broker
     from holdfast.scanner.fleet.member import FleetMember
+    from holdfast.scanner.jetstream.store import EntryStore
     from holdfast.scanner.polling.allowed_devices import AllowedDevices
     from holdfast.scanner.polling.poller import Polling
     from holdfast.scanner.presence import Presence
@@ -54,6 +56,12 @@ def presence_of(scanner: Scanner) -> Presence:
 def allowed_of(scanner: Scanner) -> AllowedDevices:
     """Returns the devices that it may use."""
     return scanner._allowed
+
+
+def store_of(scanner: Scanner) -> EntryStore:
+    """Returns what stores its subscriptions."""
+    assert isinstance(scanner._placement, StoredSubscriptions), "it stores them"
+    return scanner._placement._store
 
 
 def member_of(scanner: Scanner) -> FleetMember:

@@ -279,6 +279,8 @@ class StoredSubscriptions(Placement):
         for device in self._registry.devices.values():
             for name in (None, *device.subscribers):
                 self._store.touch(SubscriptionKey(device.id, name))
+        for owner in self._pending:
+            self._store.touch(owner)
         if self._pending:
             self._found_pending.set()
         return owners

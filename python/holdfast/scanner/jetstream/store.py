@@ -62,7 +62,8 @@ class EntryStore:
         `None` leaves what is stored as it is.
 
         `on_read` gets the stored entries after each connection. It returns the owners of those that
-        are to be replaced or removed when their owner does not want them.
+        are to be replaced or removed when their owner does not want them. It touches all owners
+        that want entries.
         """
         self._prefix = prefix
         self._entries = entries
@@ -142,6 +143,9 @@ class EntryStore:
                 if self._client is client:  # Else the connection has ended, and not JetStream.
                     self._pause_s = self._backoff.failed()
                     self._availability.failed(error)
+                    # Requests must not fill memory while JetStream fails. `on_read` will touch all
+                    # that is known: only what is gone, but stored, must be remembered.
+                    self._touched.intersection_update(self._stored)
             else:
                 self._backoff.succeeded()
                 self._availability.succeeded()

@@ -21,6 +21,7 @@ State = Literal["connecting", "online", "offline"]
 Quality = Literal["good", "bad", "uncertain"]
 DataType = Literal["number", "boolean", "string", "array"]
 
+DeviceId = Annotated[str, Meta(min_length=1, max_length=128)]
 Id = Annotated[str, Meta(min_length=1, max_length=256)]
 Address = Annotated[int, Meta(ge=0, le=LAST_ADDRESS)]
 Range = Annotated[list[FunctionCode | Address], Meta(min_length=2, max_length=3)]
@@ -83,7 +84,7 @@ class PlanRequest(Request, rename=None):
 class SubscribeRequest(Request):
     """Subscribes to tags of a device."""
 
-    device_id: Annotated[str, Meta(min_length=1, max_length=128)]
+    device_id: DeviceId
     subscriber_id: Id
     tags: list[TagRequest]
     profile: Id | None = None
@@ -117,9 +118,9 @@ class SubscribeRequest(Request):
 class UnsubscribeRequest(Request):
     """Ends a subscription, or removes tags from it."""
 
-    device_id: str
-    subscriber_id: str
-    tag_ids: list[str] | Literal["all"] | None = None
+    device_id: DeviceId
+    subscriber_id: Id
+    tag_ids: list[Id] | Literal["all"] | None = None
     """`all` is all tags of the subscriber. Required with dialect `tentacle`; otherwise the default
     is `all`."""
 
