@@ -207,6 +207,18 @@ def test_a_tag_that_two_devices_have_is_commanded_by_both_names(
     assert memory.read("holding_registers", 0, 3) == [3, 2, 0]
 
 
+def test_no_tag_has_a_name_of_more_characters_than_its_ids(
+    caller: Caller, server: holdfast.Server
+) -> None:
+    """Each dot may separate device and tag: a subject of 4 KiB would hold up other requests."""
+    device, id = "d" + 63 * ".d" + "d", "t" + 127 * ".t" + "t"
+    request = subscription(server, tag(id, 0, writable=True), deviceId=device)
+    assert caller.request("modbus.subscribe", request)["success"]
+    assert caller.request(f"modbus.command.{device}.{id}", "1")["success"]
+    answer = caller.request(f"modbus.command.{device}.{id}.t", "1")
+    assert answer["error"] == "no tag has a name of 387 characters"
+
+
 def test_a_message_that_is_refused_is_logged(
     caller: Caller,
     server: holdfast.Server,

@@ -21,8 +21,10 @@ State = Literal["connecting", "online", "offline"]
 Quality = Literal["good", "bad", "uncertain"]
 DataType = Literal["number", "boolean", "string", "array"]
 
-DeviceId = Annotated[str, Meta(min_length=1, max_length=128)]
-Id = Annotated[str, Meta(min_length=1, max_length=256)]
+MAX_DEVICE_ID = 128
+MAX_ID = 256
+DeviceId = Annotated[str, Meta(min_length=1, max_length=MAX_DEVICE_ID)]
+Id = Annotated[str, Meta(min_length=1, max_length=MAX_ID)]
 Address = Annotated[int, Meta(ge=0, le=LAST_ADDRESS)]
 Range = Annotated[list[FunctionCode | Address], Meta(min_length=2, max_length=3)]
 Ranges = Annotated[list[Range], Meta(max_length=32)]

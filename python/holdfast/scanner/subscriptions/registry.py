@@ -13,6 +13,7 @@ from holdfast.client.url import physical_connection
 from holdfast.scanner.dialects import TENTACLE, Dialect
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.messages.subject_parts import subject_id
+from holdfast.scanner.messages.types import MAX_DEVICE_ID, MAX_ID
 from holdfast.scanner.subscriptions.conflicts import (
     check_settings,
     check_subject,
@@ -234,14 +235,16 @@ class Registry:
 
     def commanded(self, name: str) -> tuple[ScannedDevice, Tag]:
         """Returns the tag of a command's name: an id, or device and id. Raises `Refused`."""
+        if len(name) > MAX_DEVICE_ID + len(".") + MAX_ID:
+            raise Refused(f"no tag has a name of {len(name)} characters")
         matches = {
             (device, id) for id in self._ids(name) for device in self._devices_of_tag.get(id, ())
         }
         # Device ids and tag ids may have dots, so each dot may separate the two.
-        parts = name.split(".")
-        for at in range(1, len(parts)):
-            device = ".".join(parts[:at])
-            for id in self._ids(".".join(parts[at:])):
+        dot = -1
+        while (dot := name.find(".", dot + 1)) >= 0:
+            device = name[:dot]
+            for id in self._ids(name[dot + 1 :]):
                 for named in {device, self._subjects.get(device, device)}:
                     if named in self._devices_of_tag.get(id, ()):
                         matches.add((named, id))
