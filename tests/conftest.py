@@ -83,8 +83,9 @@ def collected(request: pytest.FixtureRequest) -> list[str]:
 
 @pytest.fixture(autouse=True)
 def _forget_refusals(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Refusals of one test do not limit how many another one logs."""
+    """Refusals and requests of one test do not limit how many another one logs."""
     monkeypatch.setattr(log_lines, "_REFUSALS", Throttle())
+    monkeypatch.setattr(log_lines, "_REQUESTS", Throttle(burst=log_lines.MAX_REQUESTS))
 
 
 @pytest.fixture(autouse=True)

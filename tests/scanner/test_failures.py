@@ -321,6 +321,31 @@ def test_a_device_that_comes_and_goes_does_not_fill_the_log(
     assert events(caplog).count("device_online") == 2
 
 
+def test_requests_without_end_do_not_fill_the_log(
+    run_scanner: Run,
+    caller: Caller,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(log_lines, "_REQUESTS", Throttle(burst=2, window=3600))
+    caplog.set_level(logging.INFO, "holdfast")
+    run_scanner()
+    tags = [tag(id, 0, byteOrder="BADC", writable=True) for id in "abcd"]
+    for _ in range(5):
+        assert caller.request("modbus.subscribe", subscription(server, *tags))["success"]
+        assert caller.request("modbus.unsubscribe", leaving(tagIds="all"))["success"]
+    log_lines.tell_held_back(all_of_them=True)
+    logged = ("subscribed", "unsubscribed", "byte_order_differs")
+    assert [events(caplog).count(event) for event in logged] == [2, 2, 2]
+    told = [vars(each)["fields"] for each in caplog.records if each.message == "held_back"]
+    assert {(each["of"], each["count"]) for each in told} == {
+        ("subscribed", 3),
+        ("unsubscribed", 3),
+        ("byte_order_differs", 18),
+    }
+
+
 def test_a_bad_address_in_the_middle_of_a_block_costs_its_own_tag_only(
     run_scanner: Run, caller: Caller
 ) -> None:

@@ -140,6 +140,16 @@ def test_a_second_scanner_is_logged_by_both_and_shown(
     assert "otherScanners" not in caller.request("plant.browse", b"")["service"]
 
 
+def test_announcements_without_end_are_neither_logged_nor_answered(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    others = presence.OtherScanners(started=0)
+    found = [others.saw(started) for started in range(1, 1000)]
+    assert found == [True] * presence.MAX_SCANNERS + [False] * (999 - presence.MAX_SCANNERS)
+    assert len(others.current()) == presence.MAX_SCANNERS
+    assert len(logged(caplog, "another_scanner")) < presence.MAX_SCANNERS
+
+
 def test_another_service_is_noticed_by_its_heartbeat(
     run_scanner: Run,
     caller: Caller,

@@ -45,7 +45,7 @@ BY_VARIABLE = {
 }
 """The names that a file logs without a literal."""
 
-PLACES = {"write": 1, "count": 1, "limited": 1, "refused": 0, "problem": 0}
+PLACES = {"write": 1, "count": 1, "limited": 1, "requested": 1, "refused": 0, "problem": 0}
 """The functions of `log_lines`, and the place of the name among their arguments."""
 
 

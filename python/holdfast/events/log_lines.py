@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 LOGGER = logging.getLogger("holdfast")
 
+MAX_REQUESTS = 1_000
+"""After a start, programs request everything at once: that is no flood."""
+
 
 def configure(level: str, form: Format) -> None:
     """Sends the log to standard error; `level` is debug, info, warning or error."""
@@ -68,6 +71,11 @@ def limited(level: int, event: str, *, kind: object, **fields: object) -> None:
     count(level, event, fields, kind=kind)
 
 
+def requested(level: int, event: str, **fields: object) -> None:
+    """Logs a request of a client. The limit of each event is `MAX_REQUESTS` in 10 s."""
+    count(level, event, fields, kind="request", throttle=_REQUESTS)
+
+
 def count(
     level: int,
     event: str,
@@ -106,7 +114,7 @@ def tell_held_back(*, all_of_them: bool = False) -> None:
 
     At the end, have it log `all_of_them`, also where more could follow.
     """
-    for throttle in (_REFUSALS, *_OWN_LIMITS):
+    for throttle in (_REFUSALS, _REQUESTS, *_OWN_LIMITS):
         _tell_held_back(throttle, all_of_them=all_of_them)
 
 
@@ -193,6 +201,7 @@ def timestamp(seconds: float) -> str:
 
 
 _REFUSALS = Throttle()
+_REQUESTS = Throttle(burst=MAX_REQUESTS)
 _OWN_LIMITS: list[Throttle] = []
 
 Observer: TypeAlias = "Callable[[str, Mapping[str, object], Origin, int], object]"

@@ -38,7 +38,7 @@ FORGET_AFTER_S = 3 * HEARTBEAT_INTERVAL_S
 """Time after the last sign of another scanner until it is forgotten."""
 
 MAX_SCANNERS = 100
-"""Limit of other scanners that are remembered."""
+"""Limit of other scanners that are remembered. Further ones are not noticed."""
 
 
 class OtherScanners:
@@ -54,18 +54,20 @@ class OtherScanners:
             return False
         now = time.monotonic()
         self._expire(now)
-        known = started in self._seen
-        if known or len(self._seen) < MAX_SCANNERS:
-            self._seen[started] = now
-        if not known:
+        is_new = started not in self._seen
+        if is_new and len(self._seen) >= MAX_SCANNERS:
+            return False
+        self._seen[started] = now
+        if is_new:
             todo = "stop one of them, or give it another --prefix"
-            log_lines.write(
+            log_lines.limited(
                 logging.WARNING,
                 "another_scanner",
+                kind="announcement",
                 started=log_lines.timestamp(started / 1000),
                 todo=todo,
             )
-        return not known
+        return is_new
 
     def current(self) -> list[OtherScanner]:
         """Returns the other scanners that are running."""

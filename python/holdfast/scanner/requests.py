@@ -68,7 +68,7 @@ class RequestLog:
                 # Logging an adjustment twice is harmless; memory without limit is not.
                 self._written.clear()
             self._written.add((subscriber, kind))
-            log_lines.write(
+            log_lines.requested(
                 logging.WARNING, kind, subscriber=subscriber, device=device, found=found
             )
 
@@ -79,13 +79,15 @@ class RequestLog:
         about = {"subscriber": subscription.subscriber, "device": subscription.device}
         for tag, note in adjustments.byte_orders:
             if tag in new:
-                log_lines.write(logging.WARNING, "byte_order_differs", **about, tag=tag, note=note)
+                log_lines.requested(
+                    logging.WARNING, "byte_order_differs", **about, tag=tag, note=note
+                )
 
     def subscribed(self, subscription: Subscription) -> None:
         """Logs a subscription."""
         tags, rate = len(subscription.tags), subscription.rate
         fields = subscription.key.fields
-        log_lines.write(logging.INFO, "subscribed", **fields, tags=tags, scan_rate=rate)
+        log_lines.requested(logging.INFO, "subscribed", **fields, tags=tags, scan_rate=rate)
 
     def tags_not_restored(
         self, subscription: Subscription, tags: Iterable[str], reason: str
@@ -99,7 +101,7 @@ class RequestLog:
         """Logs the end of a subscription, or of some of its tags."""
         tags = "all" if request.ids is None else len(request.ids)
         fields = SubscriptionKey.of(request).fields
-        log_lines.write(logging.INFO, "unsubscribed", **fields, tags=tags)
+        log_lines.requested(logging.INFO, "unsubscribed", **fields, tags=tags)
 
 
 @dataclass(eq=False)
@@ -221,7 +223,7 @@ class Requests:
                 return
         if has_ended:
             self.former.pop(subscription, None)
-            log_lines.write(logging.INFO, "expired", **subscription.fields)
+            log_lines.requested(logging.INFO, "expired", **subscription.fields)
 
     def is_entry(self, subscription: SubscriptionKey) -> bool:
         """Whether a subscription is from an entry of a bucket."""
