@@ -187,6 +187,8 @@ def test_another_service_is_noticed_by_its_heartbeat(
         b"7",
         b"{}",
         b'{"startedAt": "x"}',
+        b'{"startedAt": -1}',
+        b'{"startedAt": %b}' % (400 * b"9"),
         b"\xff",
         b'{"startedAt":1,"fleet":"\xff"}',
         b"[" * 5000,

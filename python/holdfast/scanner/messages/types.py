@@ -38,6 +38,9 @@ MAX_DESCRIPTION = 4096
 MAX_TTL_S = 31_536_000
 """The longest `ttl` in seconds: a year."""
 
+YEAR_3000_MS = 32_503_680_000_000
+"""In milliseconds since 1970. Windows has no later dates."""
+
 
 class _Message(msgspec.Struct, rename="camel"):
     """A message with keys in camel case."""
@@ -230,7 +233,7 @@ class LogEntry(_Message):
 class Announcement(_Message, omit_defaults=True):
     """Announces a scanner to other scanners on the same subjects; a part of a heartbeat."""
 
-    started_at: int
+    started_at: Annotated[int, Meta(ge=0, le=YEAR_3000_MS)]
     """In milliseconds since 1970."""
     fleet: str | None = None
     """The fleet that the scanner is a node of."""
