@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import random
 import socket
 import struct
@@ -316,6 +317,23 @@ def test_a_broker_that_knows_only_3_1_1_is_named_as_the_reason(rig: Rig, fake5: 
     wire.until(lambda: running.status()["last_error"], "it failed")
 
     assert "Unsupported protocol version" in running.status()["last_error"]
+
+
+def test_a_second_connack_ends_the_connection(
+    rig: Rig, fake: FakeBroker, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "holdfast")
+    running = run(rig, fake)
+    with fake.accept() as peer:
+        peer.welcome()
+        for _ in range(3):
+            peer.connack()
+        peer.wait_until_closed()
+    with fake.accept() as peer:
+        assert running.status()["last_error"] == "the broker sent a second CONNACK"
+        assert [each.message for each in caplog.records].count("mqtt_connected") == 1
+        peer.welcome()
+        works(rig, peer, fake.version)
 
 
 GARBAGE = {

@@ -176,6 +176,9 @@ class BrokerClient(Client):
         properties: Properties | None,
     ) -> None:
         """Handles CONNACK."""
+        if self.is_accepted:
+            self.end("the broker sent a second CONNACK")
+            return
         if reason.is_failure:
             self.trouble = f"the broker refused the connection: {reason}"
             return
