@@ -49,6 +49,7 @@ pub(in crate::server) struct Waiting {
     is_newest: bool,
     /// What answers it, and keeps the order of what it is asked. Whatever others answer waits.
     answered_by: Discriminant<Elsewhere>,
+    is_journaled: bool,
 }
 
 /// A request that is answered elsewhere.
@@ -87,6 +88,11 @@ impl Default for Deferred {
 impl Deferred {
     pub(in crate::server) fn is_empty(&self) -> bool {
         self.waiting.is_empty()
+    }
+
+    /// Whether a journal answers those that wait. It carries them out, also if the client has gone.
+    pub(in crate::server) fn is_journaled(&self) -> bool {
+        self.waiting.front().is_some_and(|first| first.is_journaled)
     }
 
     /// The bytes of requests that are not on their way yet. While there are any, others are.
@@ -151,7 +157,16 @@ impl Deferred {
                 unit_server.forward(rights, place, &asker, unit_id, request, permit)
             });
         let answered_by = discriminant(place);
-        self.waiting.push_back(Waiting { asked, reply, times: 1, is_newest: true, answered_by });
+        let is_journaled = matches!(place, Elsewhere::Journal(_));
+        let (times, is_newest) = (1, true);
+        self.waiting.push_back(Waiting {
+            asked,
+            reply,
+            times,
+            is_newest,
+            answered_by,
+            is_journaled,
+        });
         Deferral::Later(refused)
     }
 
