@@ -496,20 +496,46 @@ def check_replicas(file: Path) -> None:
 
 
 def test_a_device_of_two_logs_is_refused(settings: Callable[..., Path]) -> None:
-    read = {"area": "holding_registers", "address": 7, "count": 2}
-    into = {"area": "holding_registers", "address": 10}
-    reads = [{**read, "into": {"memory": name, **into}} for name in ("plant", "other")]
-    file = settings("a", reads=reads)
-    text = file.read_text()
-    log = "nats://127.0.0.1:1"
-    text = text.replace(
-        '"memories": {',
-        '"memories": {"other": {"holding_registers": 20, "replicate": {"log": "second"}}, ',
-    )
-    text = text.replace('"logs": {', f'"logs": {{"second": {{"servers": ["{log}"], "node": "a"}}, ')
-    file.write_text(text)
+    reads = [read_into("plant"), read_into("other")]
+    file = with_second_log(settings("a", reads=reads))
     with pytest.raises(ConfigError, match=r"devices\.meter: found memories of the logs "):
         load(file)
+
+
+def test_devices_of_two_logs_at_one_address_are_refused(
+    settings: Callable[..., Path], device: Device
+) -> None:
+    other = {"url": device.url, "unit": 2, "interval": 1, "timeout": 3}
+    file = with_second_log(settings("a"))
+    text = file.read_text()
+
+    def add(**more: Any) -> None:
+        added = json.dumps({**other, **more})
+        file.write_text(text.replace('"devices": {', f'"devices": {{"other": {added}, '))
+
+    add(reads=[read_into("plant", 30)])
+    load(file)
+    add(reads=[read_into("other")], enabled=False)
+    load(file)
+    add(reads=[read_into("other")])
+    refused = r"devices\.meter: found a memory of the log 'site', allowed: one of 'second', as "
+    with pytest.raises(ConfigError, match=refused):
+        load(file)
+
+
+def read_into(memory: str, address: int = 10) -> dict[str, Any]:
+    into = {"memory": memory, "area": "holding_registers", "address": address}
+    return {"area": "holding_registers", "address": 7, "count": 2, "into": into}
+
+
+def with_second_log(file: Path) -> Path:
+    """The file, with a memory `other` of a second log."""
+    text = file.read_text()
+    memory = '"other": {"holding_registers": 20, "replicate": {"log": "second"}}, '
+    log = '"second": {"servers": ["nats://127.0.0.1:1"], "node": "a"}, '
+    text = text.replace('"memories": {', f'"memories": {{{memory}')
+    file.write_text(text.replace('"logs": {', f'"logs": {{{log}'))
+    return file
 
 
 def test_one_connection_has_one_name_however_it_is_written() -> None:

@@ -6,6 +6,7 @@ import os
 from typing import TYPE_CHECKING, Any
 
 from holdfast import _core
+from holdfast.client.url import connection_of
 from holdfast.config.checks.common import Owners, check_name, items, until_invalid
 from holdfast.config.checks.tls import check_client_tls, check_files
 from holdfast.config.models.base import INVALID
@@ -108,7 +109,8 @@ def _check_files(scope: Scope) -> None:
 
 
 def _check_devices(scope: Scope) -> None:
-    """Reports devices of more than one log: one lease says which node polls a device."""
+    """Reports devices of more than one log, also at one address: one lease says who polls it."""
+    at_address: dict[str, tuple[KeyPath, str]] = {}
     for path, device in items(("devices",), scope.config.devices):
         with until_invalid():
             places: list[Any] = [
@@ -122,6 +124,13 @@ def _check_devices(scope: Scope) -> None:
             if len(logs) > 1:
                 message = f"found memories of the logs {all_of(logs)}, allowed: those of one log"
                 scope.report.add_key(path, message)
+            elif logs and device.is_polled:
+                [log] = logs
+                first, other = at_address.setdefault(connection_of(device.target), (path, log))
+                if log != other:
+                    found = f"found a memory of the log {show(log)}"
+                    shared = f"as {scope.report.named(first)} has at this address"
+                    scope.report.add_key(path, f"{found}, allowed: one of {show(other)}, {shared}")
 
 
 def check_nats(path: KeyPath, nats: NatsServersConfig, report: Report) -> None:
