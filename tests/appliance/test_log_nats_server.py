@@ -239,6 +239,13 @@ def test_its_clients_can_have_a_password(tmp_path: Path) -> None:
     assert not (tmp_path / "log" / "token").exists()
 
 
+def test_a_password_that_the_server_takes_for_a_hash_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "password").write_text(f"$2a$10${53 * 'a'}\n")
+    more = ", username: scada, password_file: password"
+    told = refused(configuration(tmp_path, free_port(), more=more))
+    assert f"{tmp_path / 'password'} can't be used: its secret begins like a bcrypt hash" in told
+
+
 def test_nodes_and_the_past_can_be_shown(
     file: Path, start: Callable[[Path], RunCommand], tmp_path: Path
 ) -> None:

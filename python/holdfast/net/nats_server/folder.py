@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import secrets
 import signal
 import sys
@@ -21,6 +22,9 @@ from holdfast.runtime.whole_files import SECRET, replace
 
 LEFT_OVER_END_TIMEOUT_S = 10.0
 """Seconds that a server which has lost its appliance has to end."""
+
+_HASH = re.compile(r"\$2[abxy]\$\d{2}\$", re.ASCII)
+"""How a secret begins that nats-server takes for a hash, and compares with that of what it gets."""
 
 
 class ServerUnusable(OSError):
@@ -131,12 +135,21 @@ class Folder:
 
     def _authorization(self, access: Access) -> dict[str, str]:
         if access.username is not None:
-            secret = "" if access.password_file is None else read_secret(access.password_file)
+            secret = "" if access.password_file is None else _plain(access.password_file)
             return {"user": access.username, "password": secret}
         assert access.token_file is not None, "clients show something"
         if access.token_file.parent == self.path and not access.token_file.exists():
             replace(access.token_file, f"{secrets.token_hex(32)}\n".encode(), SECRET)
-        return {"token": read_secret(access.token_file)}
+        return {"token": _plain(access.token_file)}
+
+
+def _plain(file: Path) -> str:
+    """The password or token in a file. Raises `OSError` for one that would let nobody in."""
+    secret = read_secret(file)
+    if _HASH.match(secret):
+        problem = "its secret begins like a bcrypt hash, and nats-server takes it for one"
+        raise OSError(errno.EINVAL, problem, str(file))
+    return secret
 
 
 def _unusable(file: Path | str, error: OSError) -> ServerUnusable:
