@@ -28,7 +28,9 @@ impl Items {
     }
 }
 
-/// What a request reads, and what it writes.
+/// What a request reads, and what it writes. Without a wildcard: the ranges of a rule would not restrict a
+/// function that it covers.
+#[deny(clippy::wildcard_enum_match_arm)]
 pub(crate) fn touched(request: &Request<'_>) -> (Option<Items>, Option<Items>) {
     let items = |area, address, count: u16| Some(Items { area, address, count: count.into() });
     let (coils, registers) = (Area::Coils, Area::HoldingRegisters);
@@ -56,6 +58,15 @@ pub(crate) fn touched(request: &Request<'_>) -> (Option<Items>, Option<Items>) {
             items(registers, read.address(), read.quantity()),
             items(registers, write_address, new.quantity()),
         ),
-        _ => (None, None),
+        // Bits of a device, files, queues and what a server says of itself: not items of these areas.
+        Request::ReadExceptionStatus
+        | Request::Diagnostics(_)
+        | Request::GetCommEventCounter
+        | Request::GetCommEventLog
+        | Request::ReportServerId
+        | Request::ReadFileRecord(_)
+        | Request::WriteFileRecord(_)
+        | Request::ReadFifoQueue { .. }
+        | Request::ReadDeviceIdentification { .. } => (None, None),
     }
 }

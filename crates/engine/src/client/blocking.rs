@@ -403,6 +403,7 @@ impl Open {
 
     /// Whether the connection can carry another request: the peer has not closed it, and has not
     /// sent bytes without a request.
+    #[deny(clippy::wildcard_enum_match_arm)]
     fn is_usable(&mut self) -> bool {
         match self.transport {
             Transport::Tcp => self.used.elapsed() <= CHECK_AFTER_IDLE || !self.stream.has_ended(),
@@ -414,7 +415,8 @@ impl Open {
                 }
                 is_quiet
             }
-            _ => true,
+            // Datagrams have transaction ids. What a line has brought, `exchange` reads first.
+            Transport::Udp | Transport::SerialRtu { .. } | Transport::SerialAscii { .. } => true,
         }
     }
 

@@ -65,7 +65,7 @@ pub const MAX_READ_DELAY: Duration = Duration::from_secs(1);
 
 /// The transport of a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
+#[cfg_attr(not(feature = "exhaustive"), non_exhaustive)]
 pub enum Transport {
     /// MBAP frames in a stream: TCP, with TLS or without.
     Tcp,

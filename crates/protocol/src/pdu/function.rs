@@ -48,6 +48,32 @@ impl Function {
 
     /// Whether the function changes coils, registers or files.
     pub const fn is_write(self) -> bool {
+        match self {
+            Function::WriteSingleCoil
+            | Function::WriteSingleRegister
+            | Function::WriteMultipleCoils
+            | Function::WriteMultipleRegisters
+            | Function::WriteFileRecord
+            | Function::MaskWriteRegister
+            | Function::ReadWriteMultipleRegisters => true,
+            Function::ReadCoils
+            | Function::ReadDiscreteInputs
+            | Function::ReadHoldingRegisters
+            | Function::ReadInputRegisters
+            | Function::ReadExceptionStatus
+            | Function::Diagnostics
+            | Function::GetCommEventCounter
+            | Function::GetCommEventLog
+            | Function::ReportServerId
+            | Function::ReadFileRecord
+            | Function::ReadFifoQueue
+            | Function::EncapsulatedInterface => false,
+        }
+    }
+
+    /// Whether a request to all units of a serial line may have the function: it writes, and returns no values
+    /// (Modbus over Serial Line V1.02, 2.1).
+    pub const fn can_be_broadcast(self) -> bool {
         matches!(
             self,
             Function::WriteSingleCoil
@@ -56,14 +82,7 @@ impl Function {
                 | Function::WriteMultipleRegisters
                 | Function::WriteFileRecord
                 | Function::MaskWriteRegister
-                | Function::ReadWriteMultipleRegisters
         )
-    }
-
-    /// Whether a request to all units of a serial line may have the function: it writes, and returns no values
-    /// (Modbus over Serial Line V1.02, 2.1).
-    pub fn can_be_broadcast(self) -> bool {
-        self.is_write() && self != Function::ReadWriteMultipleRegisters
     }
 }
 

@@ -47,13 +47,22 @@ impl SubFunction {
 
     /// Whether the sub-function changes how the server behaves or what it counts.
     pub const fn changes_state(self) -> bool {
-        matches!(
-            self,
+        match self {
             SubFunction::RestartCommunications
-                | SubFunction::ChangeAsciiInputDelimiter
-                | SubFunction::ForceListenOnlyMode
-                | SubFunction::ClearCounters
-                | SubFunction::ClearOverrunCounter
-        )
+            | SubFunction::ChangeAsciiInputDelimiter
+            | SubFunction::ForceListenOnlyMode
+            | SubFunction::ClearCounters
+            | SubFunction::ClearOverrunCounter => true,
+            SubFunction::ReturnQueryData
+            | SubFunction::ReturnDiagnosticRegister
+            | SubFunction::ReturnBusMessageCount
+            | SubFunction::ReturnBusCommunicationErrorCount
+            | SubFunction::ReturnBusExceptionErrorCount
+            | SubFunction::ReturnServerMessageCount
+            | SubFunction::ReturnServerNoResponseCount
+            | SubFunction::ReturnServerNakCount
+            | SubFunction::ReturnServerBusyCount
+            | SubFunction::ReturnBusCharacterOverrunCount => false,
+        }
     }
 }

@@ -20,14 +20,29 @@ impl Answerer {
     pub(in crate::server) const PLAIN_MEMORY: Answerer =
         Answerer::Memory { exception_status: false, files: false, queues: false };
 
+    #[deny(clippy::wildcard_enum_match_arm)]
     fn knows(self, code: u8) -> bool {
         let Answerer::Memory { exception_status, files, queues } = self else { return true };
-        match Function::from_code(code) {
-            None => false,
-            Some(Function::ReadExceptionStatus) => exception_status,
-            Some(Function::ReadFileRecord | Function::WriteFileRecord) => files,
-            Some(Function::ReadFifoQueue) => queues,
-            Some(_) => true,
+        let Some(function) = Function::from_code(code) else { return false };
+        match function {
+            Function::ReadExceptionStatus => exception_status,
+            Function::ReadFileRecord | Function::WriteFileRecord => files,
+            Function::ReadFifoQueue => queues,
+            Function::ReadCoils
+            | Function::ReadDiscreteInputs
+            | Function::ReadHoldingRegisters
+            | Function::ReadInputRegisters
+            | Function::WriteSingleCoil
+            | Function::WriteSingleRegister
+            | Function::Diagnostics
+            | Function::GetCommEventCounter
+            | Function::GetCommEventLog
+            | Function::WriteMultipleCoils
+            | Function::WriteMultipleRegisters
+            | Function::ReportServerId
+            | Function::MaskWriteRegister
+            | Function::ReadWriteMultipleRegisters
+            | Function::EncapsulatedInterface => true,
         }
     }
 }
