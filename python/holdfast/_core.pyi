@@ -49,6 +49,7 @@ __all__ = [
     "MAX_LATENESS_S",
     "MAX_LINK_QUEUE",
     "MAX_PDU",
+    "READ_FUNCTIONS",
     "READ_RECORDS",
     "RETRY_PAUSES_S",
     "RETRY_REFUSED_AFTER_S",
@@ -122,6 +123,9 @@ AREAS: Final[tuple[Area, ...]]
 FUNCTIONS: Final[tuple[tuple[int, str, bool, Area | None, int, int], ...]]
 """Each function: code, name, whether it writes, its area, and the maximum number of bits or
 registers that it reads and writes."""
+
+READ_FUNCTIONS: Final[tuple[tuple[Area, int], ...]]
+"""The code of the function that reads each area."""
 
 SUB_FUNCTIONS: Final[tuple[tuple[int, str, bool], ...]]
 """Each sub-function of function 8: code, name, and whether it changes the device."""

@@ -92,9 +92,7 @@ BROADCAST_CODES = tuple(each.code for each in FUNCTIONS if each.writes and not e
 READ_WRITE = OF_CODE[23]
 """The function that writes and reads registers in one step."""
 
-READ_FUNCTIONS: dict[Area, Function] = {
-    each.area: each for each in FUNCTIONS if each.area is not None and not each.writes
-}
+READ_FUNCTIONS: dict[Area, Function] = {area: OF_CODE[code] for area, code in _core.READ_FUNCTIONS}
 """The function that reads an area, in the order of `holdfast.types.AREAS`."""
 
 READ_LIMITS: dict[Area, int] = {

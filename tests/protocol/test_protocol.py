@@ -87,6 +87,7 @@ def test_the_areas_are_the_native_ones() -> None:
     assert types.AREAS == get_args(types.Area) == _core.AREAS
     assert types.AREAS == types.BIT_AREAS + types.REGISTER_AREAS
     assert tuple(protocol.READ_FUNCTIONS) == types.AREAS
+    assert [each.code for each in protocol.READ_FUNCTIONS.values()] == [1, 2, 3, 4]
 
 
 def test_the_scanner_names_each_area_by_a_word() -> None:

@@ -21,12 +21,14 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("LAST_RECORD", limit::LAST_RECORD)?;
     module.add("AREAS", PyTuple::new(py, Area::ALL.map(Area::name))?)?;
     let functions = (0..=u8::MAX).filter_map(Function::from_code).map(|function| {
-        let (area, most_read, most_written) = use_of(function);
+        let (area, most_read, most_written) = area_and_limits(function);
         let area = area.map(Area::name);
         let (code, name) = (function.code(), function.name());
         (code, name, function.is_write(), area, most_read, most_written)
     });
     module.add("FUNCTIONS", PyTuple::new(py, functions.collect::<Vec<_>>())?)?;
+    let readers = READ_FUNCTIONS.map(|(area, function)| (area.name(), function.code()));
+    module.add("READ_FUNCTIONS", PyTuple::new(py, readers)?)?;
     let sub_functions = (0..=u16::MAX).filter_map(SubFunction::from_code);
     let sub_functions = sub_functions.map(|each| (each.code(), each.name(), each.changes_state()));
     module.add("SUB_FUNCTIONS", PyTuple::new(py, sub_functions.collect::<Vec<_>>())?)?;
@@ -48,8 +50,16 @@ pub fn add(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("MAX_LAG_S", MAX_LAG.as_secs_f64())
 }
 
-/// The area that a function reads or writes, if any, and the most items per request: read, written.
-fn use_of(function: Function) -> (Option<Area>, u16, u16) {
+/// The function that reads an area, and does nothing else.
+const READ_FUNCTIONS: [(Area, Function); Area::ALL.len()] = [
+    (Area::Coils, Function::ReadCoils),
+    (Area::DiscreteInputs, Function::ReadDiscreteInputs),
+    (Area::HoldingRegisters, Function::ReadHoldingRegisters),
+    (Area::InputRegisters, Function::ReadInputRegisters),
+];
+
+/// The area whose items are in a request or its reply, if any, and the most items of one request: read, written.
+fn area_and_limits(function: Function) -> (Option<Area>, u16, u16) {
     let (area, most_read, most_written) = match function {
         Function::ReadCoils => (Area::Coils, limit::READ_BITS, 0),
         Function::ReadDiscreteInputs => (Area::DiscreteInputs, limit::READ_BITS, 0),
