@@ -8,6 +8,8 @@ use holdfast_protocol::pdu::{
     Range, RegisterRange, Registers, Request, RequestError, SubFunction, limit,
 };
 use proptest::prelude::*;
+use proptest::strategy::ValueTree;
+use proptest::test_runner::TestRunner;
 use support::{a_request, bytes_like_a_pdu};
 
 proptest! {
@@ -38,6 +40,8 @@ proptest! {
         if !any_even {
             let stretched = [&buffer[..len], &vec![0; more]].concat();
             prop_assert_eq!(Request::parse(&stretched), refused);
+            prop_assert!(pdu::is_one_request(&buffer[..len]));
+            prop_assert!(!pdu::is_one_request(&stretched), "the length of a request is known");
         }
     }
 
@@ -262,6 +266,15 @@ fn a_range_that_ends_beyond_the_last_address_parses_for_the_memory_to_refuse() {
     assert_eq!(range.end(), 65_660);
     assert_eq!([0u16; 65_536].get(range.indices()), None);
     assert_eq!(BitRange::new(65_535, 1).unwrap().end(), 65_536);
+}
+
+#[test]
+fn every_function_is_among_the_requests_that_these_tests_generate() {
+    let mut runner = TestRunner::deterministic();
+    let mut generated = || a_request().new_tree(&mut runner).unwrap().current();
+    let found: Vec<_> = (0..1_000).map(|_| generated().request().function()).collect();
+    let missing: Vec<_> = Function::ALL.iter().filter(|each| !found.contains(each)).collect();
+    assert_eq!(missing, Vec::<&Function>::new());
 }
 
 #[test]

@@ -101,7 +101,10 @@ proptest! {
     fn a_reply_is_the_response_to_its_request(parts in a_request(), byte: u8) {
         let request = parts.request();
         let Some(reply) = a_reply(&request, byte) else { return Ok(()) };
-        match request.response(&reply).unwrap() {
+        let response = request.response(&reply).unwrap();
+        let has_no_values = response == Response::Written;
+        prop_assert_eq!(has_no_values, request.function().can_be_broadcast());
+        match response {
             Response::Bits(bits) => {
                 prop_assert!(bits.as_bytes().iter().all(|each| *each == byte));
                 prop_assert_eq!(bits.iter().count(), usize::from(bits.quantity()));
@@ -111,11 +114,7 @@ proptest! {
                 prop_assert!(registers.iter().all(|each| each == u16::from_be_bytes([byte; 2])));
                 prop_assert_eq!(registers.as_bytes().len(), reply.len() - 2);
             }
-            Response::Written => {
-                let function = request.function();
-                prop_assert!(function.is_write());
-                prop_assert_ne!(function, Function::ReadWriteMultipleRegisters);
-            }
+            Response::Written => prop_assert!(request.function().is_write()),
             Response::Diagnostics(data) => prop_assert_eq!(data, &reply[3..]),
             Response::EventCounter { busy, events } => {
                 prop_assert_eq!((busy, events), (byte.is_multiple_of(2), u16::from(byte)));

@@ -101,7 +101,8 @@ fn of_files() -> impl Strategy<Value = Parts> {
     )
 }
 
-/// Requests of every function, with all values that they can have.
+/// Requests of every function, with all values that they can have. A test of `properties.rs` fails if one is
+/// missing.
 pub fn a_request() -> impl Strategy<Value = Parts> {
     let code = prop::sample::select(ReadCode::ALL);
     let whole = prop_oneof![
