@@ -73,16 +73,8 @@ impl Function {
 
     /// Whether a request to all units of a serial line may have the function: it writes, and returns no values
     /// (Modbus over Serial Line V1.02, 2.1).
-    pub const fn can_be_broadcast(self) -> bool {
-        matches!(
-            self,
-            Function::WriteSingleCoil
-                | Function::WriteSingleRegister
-                | Function::WriteMultipleCoils
-                | Function::WriteMultipleRegisters
-                | Function::WriteFileRecord
-                | Function::MaskWriteRegister
-        )
+    pub fn can_be_broadcast(self) -> bool {
+        self.is_write() && self != Function::ReadWriteMultipleRegisters
     }
 }
 
