@@ -121,8 +121,8 @@ impl Request {
             let allowed = allowed.collect::<Vec<_>>().join(", ");
             PyValueError::new_err(format!("sub_function is {}, allowed: {allowed}", sub_function.0))
         })?;
-        let asked = Diagnostics::new(sub_function, &data).map_err(refused)?;
-        Ok(encoded(&CoreRequest::Diagnostics(asked)))
+        let query = Diagnostics::new(sub_function, &data).map_err(refused)?;
+        Ok(encoded(&CoreRequest::Diagnostics(query)))
     }
 
     #[staticmethod]

@@ -23,7 +23,7 @@ pub struct Gate {
 }
 
 impl Gate {
-    /// Whether an access may write a range: clients can't open the memory.
+    /// Refuses a client's write to the gate bit: clients can't open the memory.
     #[inline]
     pub(crate) fn admit_write(
         self,
@@ -45,10 +45,10 @@ impl Gate {
         }
     }
 
-    /// Whether the memory is sealed after a restart with these contents of this layout, whose age is
-    /// unknown. A gate that opens once is closed again, and its bit becomes 0: the next write would open
-    /// it otherwise.
-    pub fn seals_restored(self, layout: &Layout, areas: &mut [Box<[u8]>]) -> bool {
+    /// Sets the bit of a gate that opens once to 0 in contents that were restored after a restart: the next
+    /// write would open the memory otherwise. Returns whether the memory is sealed: how old the contents are
+    /// is unknown, so a gate that opens once is closed again.
+    pub fn restore_seal(self, layout: &Layout, areas: &mut [Box<[u8]>]) -> bool {
         let offset = usize::from(self.address - layout.span(self.area).start());
         let area = &mut areas[self.area.index()];
         if self.mode == GateMode::Once {
@@ -58,7 +58,7 @@ impl Gate {
     }
 }
 
-/// Whether the seal admits an access.
+/// Refuses an access that the seal does not admit.
 #[inline]
 pub(crate) const fn admit(access: Access, is_sealed: bool) -> Result<(), Refusal> {
     match (access, is_sealed) {

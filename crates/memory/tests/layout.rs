@@ -110,7 +110,7 @@ fn after_a_restart_a_gate_that_opens_once_is_closed_and_one_with_a_level_is_as_i
         let memory = gated(mode);
         let mut areas: Vec<Box<[u8]>> = vec![bytes.to_vec().into_boxed_slice()];
         let gate = memory.gate().unwrap();
-        assert_eq!(gate.seals_restored(memory.layout(), &mut areas), sealed);
+        assert_eq!(gate.restore_seal(memory.layout(), &mut areas), sealed);
         assert_eq!(*areas[0], left);
     }
 }

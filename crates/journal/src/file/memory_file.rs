@@ -141,7 +141,7 @@ impl MemoryFile {
                 let mut areas = stored.with(set_aside).resized(memory.layout());
                 let sealed = memory
                     .gate()
-                    .is_some_and(|gate| gate.seals_restored(memory.layout(), &mut areas));
+                    .is_some_and(|gate| gate.restore_seal(memory.layout(), &mut areas));
                 memory.restore(&Contents { areas, sealed });
             }
             loaded.push(name.clone());

@@ -26,7 +26,7 @@ pub(crate) enum Ranges {
 }
 
 impl Memory {
-    /// Whether the seal and the journal admit an access.
+    /// Refuses an access that the seal or the journal does not admit.
     #[inline]
     pub(super) fn admit(&self, content: &Content, access: Access) -> Result<(), Refusal> {
         if content.is_open_to(access) { Ok(()) } else { self.judge(content, access) }
@@ -160,7 +160,7 @@ impl Content {
         self.access_flags == 0 && !matches!(access, Access::Restore)
     }
 
-    /// Whether the seal admits an access. Called with the lock under which the write is carried out, so
+    /// Refuses an access that the seal does not admit. Called with the lock under which the write is carried out, so
     /// no write is judged by a seal that has changed since.
     pub(super) fn admit(&self, access: Access) -> Result<(), Refusal> {
         seal::admit(access, self.sealed())

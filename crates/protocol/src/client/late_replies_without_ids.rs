@@ -52,11 +52,10 @@ const MAX_RECENT_REPLIES: usize = 16;
 /// A reply that came longer ago is not repeated now.
 const RECENT_REPLY_TIME: Duration = MAX_GUARD;
 
-/// How long after a reply that is not its own that may come to a request within its timeout, if the unit is usually
-/// faster.
+/// After a reply to another request: how long a request still waits for its own, if the unit is usually faster.
 const WAIT_AFTER_OTHER_REPLY: Duration = Duration::from_millis(500);
 
-/// How long after a damaged reply its own may come to a request, as long as nothing is known of the unit.
+/// After a damaged reply: how long a request still waits for its own, while nothing is known of the unit.
 const WAIT_AFTER_DAMAGED_REPLY: Duration = Duration::from_millis(250);
 
 /// What earlier requests may still bring.
@@ -68,14 +67,13 @@ pub(super) struct LateReplies {
     never_came: BTreeSet<(u8, u8)>,
     lateness: Lateness,
     guard: Guard,
-    /// When something was received the last time, or a request ended.
-    pub(super) used: Time,
+    /// When something was last received, or a request sent or ended.
+    pub(super) last_activity: Time,
     /// The line is faster than its settings say: replies showed it that were the first ones, or the only ones.
     is_fast: bool,
-    /// A late reply has come.
-    has_late: bool,
-    /// What a request and its reply need on the line, of which no other came than one that was too fast. None
-    /// that need as long have come since.
+    late_reply_came: bool,
+    /// The time on the line of a request whose only reply came faster than the line allows, and of that reply. No
+    /// exchange that takes as long has had a slower reply since.
     only_too_fast: Option<Duration>,
     /// Reads in a row whose echo came before their reply. Here because a new connection keeps it.
     pub(super) echoes: u8,
@@ -198,7 +196,7 @@ impl LateReplies {
     pub(super) fn shows_fast_line(&mut self, reply: &[u8]) -> bool {
         let reply = crc32fast::hash(reply);
         let is_copy = self.recent.iter().any(|recent| recent.reply == reply);
-        self.is_fast |= self.guard.learned.is_none() && !self.has_late && !is_copy;
+        self.is_fast |= self.guard.learned.is_none() && !self.late_reply_came && !is_copy;
         self.is_fast
     }
 
@@ -335,7 +333,7 @@ impl LateReplies {
     /// Notes the late reply to the request at this place. Returns how long it took; 0 if it may have waited to
     /// be read, or if others may follow: copies of it, or the confirmations of a broadcast by other units.
     pub(super) fn late(&mut self, place: usize, now: Time) -> Duration {
-        self.has_late = true;
+        self.late_reply_came = true;
         let may_repeat = |earlier: &Unanswered| {
             now < if earlier.is_broadcast { earlier.until } else { earlier.from }
         };

@@ -157,7 +157,7 @@ impl OneAtATime {
         let ticket = flights.push(call, 0, may_begin);
         let until = self
             .silence
-            .map_or(may_begin, |silence| may_begin.max(self.late_replies.used + silence));
+            .map_or(may_begin, |silence| may_begin.max(self.late_replies.last_activity + silence));
         self.state = State::Quieting { until };
         self.transmit(flights, now);
         ticket
@@ -185,8 +185,8 @@ impl OneAtATime {
             return Time::ZERO;
         }
         let clear = self.late_replies.until(unit_id, request, &flights.tolerance, now);
-        let used = self.late_replies.used;
-        let guarded = if used.is_zero() { used } else { used + self.late_replies.guard() };
+        let last = self.late_replies.last_activity;
+        let guarded = if last.is_zero() { last } else { last + self.late_replies.guard() };
         clear.unwrap_or_default().max(guarded)
     }
 
@@ -219,7 +219,7 @@ impl OneAtATime {
             let sent = now + self.character * self.frame.len() as u32;
             flights.transmitted(self.late_replies.timeout(unit_id, self.timeout), sent);
             // Also for the next connection.
-            self.late_replies.used = sent;
+            self.late_replies.last_activity = sent;
             self.late_replies.expire(now);
             self.received.clear();
             let broadcast = flights.first().filter(|flight| flight.unit_id == 0);
@@ -300,9 +300,9 @@ impl OneAtATime {
         }
         if late == 0 && is_frame(self.framing, &self.received) {
             self.received.clear();
-            self.late_replies.stray(now.saturating_sub(self.late_replies.used));
+            self.late_replies.stray(now.saturating_sub(self.late_replies.last_activity));
         }
-        self.late_replies.used = now;
+        self.late_replies.last_activity = now;
         if self.silence.is_none() && is_idle && late == 0 && !may_be_surplus {
             flights.close(Closed::Invalid(InvalidResponse::Unrequested), sink);
         }
@@ -709,7 +709,7 @@ impl OneAtATime {
     fn rest(&mut self, now: Time) {
         self.state = State::Idle;
         self.received.clear();
-        self.late_replies.used = now;
+        self.late_replies.last_activity = now;
     }
 
     pub(super) fn advance(
@@ -764,7 +764,7 @@ impl OneAtATime {
         }
         if let Some(flight) = flights.expired(now) {
             let sent = !matches!(self.state, State::Quieting { .. });
-            (self.state, self.late_replies.used) = (State::Idle, now);
+            (self.state, self.late_replies.last_activity) = (State::Idle, now);
             self.keep_begun(flights);
             let too_fast = self.too_fast.map(|_| InvalidResponse::TooFast);
             let invalid = too_fast.or(self.stray.map(InvalidResponse::Frame));

@@ -154,13 +154,13 @@ pub fn mask_write_register(address: u16, and_mask: u16, or_mask: u16, pdu: &mut 
 /// use holdfast_protocol::pdu::{self, Request, reply};
 ///
 /// let request = [8, 0, 0, 0xA5, 0x37];
-/// let Ok(Request::Diagnostics(asked)) = Request::parse(&request) else { unreachable!() };
+/// let Ok(Request::Diagnostics(query)) = Request::parse(&request) else { unreachable!() };
 /// let mut pdu = [0; pdu::MAX_LEN];
-/// let len = reply::diagnostics_echo(asked, &mut pdu);
+/// let len = reply::diagnostics_echo(query, &mut pdu);
 /// assert_eq!(pdu[..len], request);
 /// ```
-pub fn diagnostics_echo(asked: Diagnostics<'_>, pdu: &mut Buffer) -> usize {
-    Request::Diagnostics(asked).encode(pdu)
+pub fn diagnostics_echo(query: Diagnostics<'_>, pdu: &mut Buffer) -> usize {
+    Request::Diagnostics(query).encode(pdu)
 }
 
 /// Answers a sub-function of Diagnostics that reads a counter or register (function 8).

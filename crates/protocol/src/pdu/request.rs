@@ -203,9 +203,9 @@ impl<'a> Request<'a> {
             }
             Request::WriteSingleCoil { address, value } => put_words(pdu, [address, coil(value)]),
             Request::WriteSingleRegister { address, value } => put_words(pdu, [address, value]),
-            Request::Diagnostics(asked) => {
-                let head = put_words(pdu, [asked.sub_function().code()]);
-                put(pdu, head, asked.data())
+            Request::Diagnostics(query) => {
+                let head = put_words(pdu, [query.sub_function().code()]);
+                put(pdu, head, query.data())
             }
             Request::ReadExceptionStatus
             | Request::GetCommEventCounter
@@ -241,7 +241,7 @@ impl<'a> Request<'a> {
     /// Whether the request only reads: repeating it changes nothing.
     pub const fn is_read(&self) -> bool {
         match self {
-            Request::Diagnostics(asked) => !asked.sub_function().changes_state(),
+            Request::Diagnostics(query) => !query.sub_function().changes_state(),
             _ => !self.function().is_write(),
         }
     }

@@ -124,9 +124,9 @@ impl Request<'_> {
                 [status] => Ok(Response::ExceptionStatus(status)),
                 _ => Err(ResponseError::Length),
             },
-            Request::Diagnostics(asked) => match body {
-                [high, low, data @ ..] if data.len() == asked.data().len() => {
-                    if u16::from_be_bytes([*high, *low]) == asked.sub_function().code() {
+            Request::Diagnostics(query) => match body {
+                [high, low, data @ ..] if data.len() == query.data().len() => {
+                    if u16::from_be_bytes([*high, *low]) == query.sub_function().code() {
                         Ok(Response::Diagnostics(data))
                     } else {
                         Err(ResponseError::Echo)
