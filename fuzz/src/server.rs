@@ -91,7 +91,7 @@ fn rights(memory: &Arc<Memory>) -> PeerRights {
         sources: Vec::new(),
         roles: None,
         units: vec![(UNITS[0], Arc::clone(memory)), (UNITS[1], Arc::clone(memory))],
-        elsewhere: Vec::new(),
+        destinations: Vec::new(),
         access: AccessMode::ReadWrite,
         functions: Functions::All,
         narrowed: vec![(UNITS[1], narrowed)],

@@ -8,7 +8,7 @@ use holdfast_engine::items::Items;
 use holdfast_engine::server::requests::unit_server::UnitSettings;
 use holdfast_engine::server::rights::functions::{AccessMode, Functions};
 use holdfast_engine::server::rights::ranges::Ranges;
-use holdfast_engine::server::rights::rule::{Elsewhere, Narrowed, Rule as CoreRule};
+use holdfast_engine::server::rights::rule::{Narrowed, RequestDestination, Rule as CoreRule};
 use holdfast_engine::server::{
     AfterRefusal, ConnectionLimits, DatagramFraming, Flags, ListenerKind, ListenerSettings,
     PacketsPerConnection, RawRule as CoreRawRule, RawSettings, SerialSettings, StreamFraming,
@@ -111,15 +111,15 @@ impl Rule {
             let address = |address| Ok(within("address", address, 0..=65_535)? as u16);
             own.queues = addresses.into_iter().map(address).collect::<PyResult<_>>()?;
         }
-        let (mut memories, mut elsewhere) = (Vec::new(), Vec::new());
+        let (mut memories, mut destinations) = (Vec::new(), Vec::new());
         for item in units.items()?.iter() {
             let (unit, target): (i128, Bound<'_, PyAny>) = item.extract()?;
             let unit = byte("unit id", unit)?;
             if let Ok(route) = target.extract::<PyRef<'_, Route>>() {
-                elsewhere.push((unit, Elsewhere::Device(route.core.clone())));
+                destinations.push((unit, RequestDestination::Device(route.core.clone())));
             } else if let Ok(passage) = target.extract::<PyRef<'_, Passage>>() {
                 memories.push((unit, Arc::clone(&passage.core.memory)));
-                elsewhere.push((unit, Elsewhere::Mirror(Arc::clone(&passage.core))));
+                destinations.push((unit, RequestDestination::Mirror(Arc::clone(&passage.core))));
             } else {
                 let memory: PyRef<'_, Memory> = target.extract()?;
                 memories.push((unit, Arc::clone(&memory.core)));
@@ -131,7 +131,7 @@ impl Rule {
                 sources: networks(&sources.unwrap_or_default())?,
                 roles,
                 units: memories,
-                elsewhere,
+                destinations,
                 access,
                 functions,
                 narrowed: narrowed.into_iter().collect(),
@@ -156,7 +156,7 @@ impl Rule {
     #[getter]
     fn unit_ids(&self) -> BTreeSet<u8> {
         let memories = self.core.units.iter().map(|(unit, _)| *unit);
-        memories.chain(self.core.elsewhere.iter().map(|(unit, _)| *unit)).collect()
+        memories.chain(self.core.destinations.iter().map(|(unit, _)| *unit)).collect()
     }
 }
 

@@ -84,7 +84,7 @@ impl Setup {
             sources: vec!["127.0.0.1/32".parse().unwrap()],
             roles: None,
             units: vec![(1, Arc::clone(&memory))],
-            elsewhere: Vec::new(),
+            destinations: Vec::new(),
             access: AccessMode::ReadWrite,
             functions: Functions::All,
             narrowed: Vec::new(),

@@ -14,7 +14,7 @@ fn rule(sources: &[&str], unit: u8, rights: AccessMode, functions: Functions) ->
         sources: sources.iter().map(|source| source.parse().unwrap()).collect(),
         roles: None,
         units: vec![(unit, Arc::new(Memory::new(Layout::default(), None).unwrap()))],
-        elsewhere: Vec::new(),
+        destinations: Vec::new(),
         access: rights,
         functions,
         narrowed: Vec::new(),

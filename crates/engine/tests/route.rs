@@ -16,7 +16,7 @@ use holdfast_engine::poller::Poller;
 use holdfast_engine::server::reports::event::Verbosity;
 use holdfast_engine::server::requests::unit_server::UnitSettings;
 use holdfast_engine::server::rights::functions::{AccessMode, Functions};
-use holdfast_engine::server::rights::rule::{Elsewhere, Rule};
+use holdfast_engine::server::rights::rule::{RequestDestination, Rule};
 use holdfast_engine::server::{
     ConnectionLimits, DatagramFraming, Engine, ListenerKind, ListenerSettings, Listening, Settings,
     StreamFraming, StreamSettings, UdpSettings, WhenFull,
@@ -155,7 +155,7 @@ impl Setup {
             sources: vec!["127.0.0.0/8".parse().unwrap()],
             roles: None,
             units: Vec::new(),
-            elsewhere: vec![(1, Elsewhere::Device(route))],
+            destinations: vec![(1, RequestDestination::Device(route))],
             access: AccessMode::ReadWrite,
             functions: Functions::All,
             narrowed: Vec::new(),

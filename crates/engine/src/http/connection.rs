@@ -28,7 +28,7 @@ use super::response_body::ResponseBody;
 use crate::server::Peer;
 use crate::server::connections::admission::Ticket;
 use crate::server::connections::closing::drain_for;
-use crate::server::connections::listener::{Admitted, KEEPALIVE, set_options};
+use crate::server::connections::listener::{Admitted, KEEPALIVE, set_tcp_options};
 use crate::server::reports::event::Kind;
 use crate::server::transports::secure::secured;
 use crate::server::transports::stream::Stream;
@@ -63,7 +63,7 @@ pub(super) async fn serve(
     stop: watch::Receiver<bool>,
 ) {
     let Admitted { stream, peer, ticket, .. } = connection;
-    set_options(&stream, KEEPALIVE);
+    set_tcp_options(&stream, KEEPALIVE);
     // One time for the handshake and the first request.
     let due = Instant::now() + front.settings.request_timeout;
     let begun = begin(&front, (stream, peer), &ticket, due, stop.clone()).await;

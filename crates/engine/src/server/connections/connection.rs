@@ -45,7 +45,8 @@ const fn output<F: Framing>(least: usize) -> usize {
     assert!(F::MAX_LEN < INPUT_BYTES);
     assert!(F::HEADER_LEN + pdu::MAX_LEN <= F::MAX_LEN);
     // Those that waited have an MBAP header: in ASCII, as many would be longer.
-    let shortest = if F::SHORTEST < Mbap::SHORTEST { F::SHORTEST } else { Mbap::SHORTEST };
+    let shortest =
+        if F::MIN_FRAME_LEN < Mbap::MIN_FRAME_LEN { F::MIN_FRAME_LEN } else { Mbap::MIN_FRAME_LEN };
     let len = (INPUT_BYTES / shortest + 1) * F::MAX_LEN;
     if len > least { len } else { least }
 }
@@ -107,7 +108,7 @@ struct Answering<F: Framing> {
     /// The beginning of an incomplete request. Most connections never have one.
     partial: Vec<u8>,
     /// What is known of the bytes before it.
-    before: F::Before,
+    parser: F::ParserState,
     /// The last character of an ASCII frame, which the peer can change.
     delimiter: u8,
     reported: Reported,
@@ -346,7 +347,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             self.note_exchange(now);
         }
         self.share.charge(work_before + (answered.requests + answered.discarded) as u32);
-        let is_at_start = F::is_at_start(&self.answering.before);
+        let is_at_start = F::is_at_start(&self.answering.parser);
         if self.answering.partial.is_empty() && is_at_start && !self.stream.is_amid_record() {
             return self.deadlines.note_complete();
         }
@@ -456,7 +457,7 @@ impl<F: Framing> Answering<F> {
             unit_server,
             rights,
             partial: Vec::new(),
-            before: F::Before::default(),
+            parser: F::ParserState::default(),
             delimiter: ASCII_DELIMITER,
             reported: Reported::default(),
             deferred: None,
@@ -476,9 +477,9 @@ impl<F: Framing> Answering<F> {
         let mut answered =
             Answered { len: 0, requests: 0, discarded: 0, consumed: 0, broken: false };
         let mut rest = input;
-        let mut decoded = F::NOT_DECODED;
+        let mut decoded = F::EMPTY_DECODED;
         loop {
-            match F::next(&mut self.before, rest, || self.delimiter, &mut decoded) {
+            match F::next(&mut self.parser, rest, || self.delimiter, &mut decoded) {
                 Next::Request { tag, unit_id, pdu, len } => {
                     if std::mem::take(&mut self.gives_up) {
                         self.give_up();
@@ -516,13 +517,14 @@ impl<F: Framing> Answering<F> {
     /// of the framed reply, 0 when there is none, or none yet.
     #[inline]
     fn take(&mut self, (tag, unit_id, pdu): (u16, u8, &[u8]), output: &mut [u8]) -> usize {
-        let place = self.unit_server.elsewhere(&self.rights, unit_id, pdu);
-        if place.is_some() || self.deferred.is_some() {
+        let destination = self.unit_server.destination(&self.rights, unit_id, pdu);
+        if destination.is_some() || self.deferred.is_some() {
             let deferred = self.deferred.get_or_insert_default();
             let ours = (&*self.unit_server, &*self.rights, &*self.context);
             let request = (tag, unit_id, pdu);
             let peer = self.peer.ip();
-            if let Deferral::Later(refused) = deferred.defer(ours, place, peer, F::HAS_IDS, request)
+            if let Deferral::Later(refused) =
+                deferred.defer(ours, destination, peer, F::HAS_IDS, request)
             {
                 self.context.note_refused(refused, &self.reported, Some(&self.peer));
                 return 0;
@@ -556,7 +558,7 @@ impl<F: Framing> Answering<F> {
             self.partial.clear();
             self.unit_server.discard(|frames| &frames.damaged);
         }
-        self.before = F::Before::default();
+        self.parser = F::ParserState::default();
     }
 
     /// Whether replies come later.
@@ -696,7 +698,7 @@ mod tests {
             sources: Vec::new(),
             roles: None,
             units: vec![(1, memory)],
-            elsewhere: Vec::new(),
+            destinations: Vec::new(),
             access: AccessMode::ReadWrite,
             functions: Functions::All,
             narrowed: Vec::new(),
@@ -964,13 +966,13 @@ mod tests {
         let shortest = frame(1, &[17]);
         let input = shortest.repeat(INPUT_BYTES / shortest.len());
         let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
-        assert_eq!(answered.requests, INPUT_BYTES / Mbap::SHORTEST);
+        assert_eq!(answered.requests, INPUT_BYTES / Mbap::MIN_FRAME_LEN);
         assert!(answered.requests * mbap::MAX_LEN <= OUTPUT_BYTES);
 
         let shortest = ascii_frame(1, &[17]);
         let input = shortest.repeat(INPUT_BYTES / shortest.len());
         let answered = answering::<Ascii>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
-        assert_eq!(answered.requests, INPUT_BYTES / Ascii::SHORTEST);
+        assert_eq!(answered.requests, INPUT_BYTES / Ascii::MIN_FRAME_LEN);
         assert!(answered.requests * ascii::MAX_LEN <= OUTPUT_BYTES);
     }
 

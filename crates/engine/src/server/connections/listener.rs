@@ -385,12 +385,12 @@ fn bind(socket: &Socket, address: SocketAddr) -> io::Result<()> {
     socket.set_nonblocking(true)
 }
 
-/// Disables delays of replies, and enables keepalive to detect lost peers. The options are not
+/// Disables delays of replies, and detects lost peers by probes after a silence of this time. The options are not
 /// essential: errors are ignored.
-pub(crate) fn set_options(stream: &TcpStream, idle: Duration) {
+pub(crate) fn set_tcp_options(stream: &TcpStream, keepalive_after: Duration) {
     // Systems count whole seconds.
-    let interval = (idle / KEEPALIVE_PROBES).max(Duration::from_secs(1));
-    let keepalive = TcpKeepalive::new().with_time(idle).with_interval(interval);
+    let interval = (keepalive_after / KEEPALIVE_PROBES).max(Duration::from_secs(1));
+    let keepalive = TcpKeepalive::new().with_time(keepalive_after).with_interval(interval);
     // Windows always sends ten probes.
     #[cfg(not(target_os = "windows"))]
     let keepalive = keepalive.with_retries(KEEPALIVE_PROBES);

@@ -27,7 +27,7 @@ use crate::server::reports::refused_request::RefusedRequest;
 use crate::server::requests::unit_server::UnitServer;
 use crate::server::rights::functions::only_reads;
 use crate::server::rights::peer_rights::PeerRights;
-use crate::server::rights::rule::Elsewhere;
+use crate::server::rights::rule::RequestDestination;
 
 /// The most requests of a connection that wait for replies.
 pub(in crate::server) const MAX_WAITING: usize = 16;
@@ -48,7 +48,7 @@ pub(in crate::server) struct Waiting {
     /// Whether no other request with its transaction id has come after it.
     is_newest: bool,
     /// What answers it, and keeps the order of what it is asked. Whatever others answer waits.
-    answered_by: Discriminant<Elsewhere>,
+    answered_by: Discriminant<RequestDestination>,
     is_journaled: bool,
 }
 
@@ -123,7 +123,7 @@ impl Deferred {
     pub(in crate::server) fn defer(
         &mut self,
         (unit_server, rights, context): (&UnitServer, &PeerRights, &ListenerContext),
-        place: Option<&Elsewhere>,
+        destination: Option<&RequestDestination>,
         peer: IpAddr,
         has_ids: bool,
         (tag, unit_id, request): (u16, u8, &[u8]),
@@ -131,19 +131,20 @@ impl Deferred {
         if has_ids && self.repeats((tag, unit_id, request)) {
             return Deferral::Later(None);
         }
-        let place = match place.filter(|_| self.behind.is_empty()) {
+        let destination = match destination.filter(|_| self.behind.is_empty()) {
             // Without a request before it, nothing can reorder its effects.
             None if self.is_empty() => return Deferral::Now,
             // A write to a mirror also changes the memory, which requests before it may read or write.
-            Some(place @ Elsewhere::Mirror(_)) if self.is_empty() => place,
-            Some(place @ (Elsewhere::Device(_) | Elsewhere::Journal(_)))
-                if self.has_room()
-                    && self
-                        .waiting
-                        .iter()
-                        .all(|other| other.answered_by == discriminant(place)) =>
+            Some(destination @ RequestDestination::Mirror(_)) if self.is_empty() => destination,
+            Some(
+                destination @ (RequestDestination::Device(_) | RequestDestination::Journal(_)),
+            ) if self.has_room()
+                && self
+                    .waiting
+                    .iter()
+                    .all(|other| other.answered_by == discriminant(destination)) =>
             {
-                place
+                destination
             }
             _ => {
                 self.behind.extend_from_slice(&mbap::header(tag, unit_id, request.len()));
@@ -153,11 +154,11 @@ impl Deferred {
         };
         let asker = Asker { source: self.source, peer: Some(peer) };
         let (asked, reply, refused) =
-            Asked::send(context, place, (tag, unit_id, request), |permit| {
-                unit_server.forward(rights, place, &asker, unit_id, request, permit)
+            Asked::send(context, destination, (tag, unit_id, request), |can_record| {
+                unit_server.forward(rights, destination, &asker, unit_id, request, can_record)
             });
-        let answered_by = discriminant(place);
-        let is_journaled = matches!(place, Elsewhere::Journal(_));
+        let answered_by = discriminant(destination);
+        let is_journaled = matches!(destination, RequestDestination::Journal(_));
         let (times, is_newest) = (1, true);
         self.waiting.push_back(Waiting {
             asked,
@@ -227,7 +228,7 @@ impl Asked {
     /// Sends a request on its way by `forward`, which asks for a permit before. It may be refused at once.
     pub(in crate::server) fn send(
         context: &ListenerContext,
-        place: &Elsewhere,
+        destination: &RequestDestination,
         (tag, unit_id, request): (u16, u8, &[u8]),
         forward: impl FnOnce(
             &mut dyn FnMut() -> bool,
@@ -239,7 +240,7 @@ impl Asked {
             permit.is_some()
         });
         let permit = permit.filter(|_| sent.is_ok());
-        let refused = RefusedRequest::before_sending(place, unit_id, request, &sent);
+        let refused = RefusedRequest::before_sending(destination, unit_id, request, &sent);
         let (route, reply) = match sent {
             Ok((route, pending)) => (route, Expected::Pending(pending)),
             Err(code) => {
@@ -247,7 +248,7 @@ impl Asked {
                 (None, Expected::Known(Reply { pdu, ..Reply::default() }))
             }
         };
-        let memory = place.memory().and_then(Memory::name).cloned();
+        let memory = destination.memory().and_then(Memory::name).cloned();
         (Asked { tag, unit_id, memory, route, request: request.to_vec(), permit }, reply, refused)
     }
 

@@ -80,7 +80,7 @@ fn stream(memory: &Arc<Memory>, raw_ingest: Option<RawSettings>) -> StreamSettin
             sources: vec!["127.0.0.1/32".parse().unwrap()],
             roles: None,
             units: vec![(1, Arc::clone(memory))],
-            elsewhere: Vec::new(),
+            destinations: Vec::new(),
             access: AccessMode::ReadWrite,
             functions: Functions::All,
             narrowed: Vec::new(),

@@ -9,7 +9,7 @@ use holdfast_protocol::pdu::ExceptionCode;
 use crate::link::exception_in;
 use crate::server::rights::functions::is_write;
 use crate::server::rights::peer_rights::PeerRights;
-use crate::server::rights::rule::Elsewhere;
+use crate::server::rights::rule::RequestDestination;
 
 /// A refused request.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -68,18 +68,20 @@ impl RefusedRequest {
     /// The refusal of a request that was rejected before it was sent on. `None` if it was sent, or failed
     /// for another reason, such as a full queue.
     pub(crate) fn before_sending<T>(
-        place: &Elsewhere,
+        destination: &RequestDestination,
         unit_id: u8,
         request: &[u8],
         sent: &Result<T, ExceptionCode>,
     ) -> Option<RefusedRequest> {
         match *sent.as_ref().err()? {
             // A full queue and a log that can't be used have the same exception.
-            ExceptionCode::ServerDeviceBusy if place.memory().is_some_and(Memory::sealed) => {
+            ExceptionCode::ServerDeviceBusy if destination.memory().is_some_and(Memory::sealed) => {
                 Some(RefusedRequest::new(unit_id, request, Why::Sealed))
             }
             // Devices on a line could find another request in it, with a function that the peer may not use.
-            ExceptionCode::IllegalDataValue if matches!(place, Elsewhere::Device(_)) => {
+            ExceptionCode::IllegalDataValue
+                if matches!(destination, RequestDestination::Device(_)) =>
+            {
                 Some(RefusedRequest::new(unit_id, request, Why::Function))
             }
             code => RefusedRequest::from_exception(unit_id, request, code),
@@ -138,7 +140,7 @@ mod tests {
             sources: Vec::new(),
             roles: None,
             units: vec![(1, Arc::new(memory))],
-            elsewhere: Vec::new(),
+            destinations: Vec::new(),
             access: AccessMode::ReadWrite,
             functions: Functions::All,
             narrowed: Vec::new(),
@@ -162,8 +164,9 @@ mod tests {
         let layout = Layout::default().with(Area::Coils, Span::new(0, 1).unwrap());
         let gate = Gate { area: Area::Coils, address: 0, mode: GateMode::Once };
         let refused = |gate, code| {
-            let place = Elsewhere::Journal(Arc::new(Memory::new(layout.clone(), gate).unwrap()));
-            let refused = RefusedRequest::before_sending::<()>(&place, 1, &WRITE, &Err(code));
+            let destination =
+                RequestDestination::Journal(Arc::new(Memory::new(layout.clone(), gate).unwrap()));
+            let refused = RefusedRequest::before_sending::<()>(&destination, 1, &WRITE, &Err(code));
             refused.map(|refused| refused.why)
         };
         let busy = ExceptionCode::ServerDeviceBusy;

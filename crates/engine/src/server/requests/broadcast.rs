@@ -9,7 +9,7 @@ use crate::link::exception_in;
 use crate::server::reports::comm_events::Received;
 use crate::server::reports::refused_request::RefusedRequest;
 use crate::server::requests::journaled_write;
-use crate::server::requests::unit_server::{UnitServer, outside};
+use crate::server::requests::unit_server::{UnitServer, exceeds_ranges};
 use crate::server::rights::peer_rights::PeerRights;
 
 impl UnitServer {
@@ -31,8 +31,9 @@ impl UnitServer {
         self.counters.unanswered.add();
         self.comm_events.receive(Received::Broadcast);
         let (mut carried_out, mut refused, mut reported) = (false, None, None);
-        let may =
-            |unit_id| rights.allows(unit_id, function_code) && !outside(rights, unit_id, request);
+        let may = |unit_id| {
+            rights.allows(unit_id, function_code) && !exceeds_ranges(rights, unit_id, request)
+        };
         for unit_id in
             one_unit_of_each_memory(rights, |unit_id| !self.listen_only.is_on(unit_id), may)
         {

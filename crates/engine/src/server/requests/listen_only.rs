@@ -53,8 +53,8 @@ impl ListenOnly {
 
     /// Ends the mode if that is what a request to the unit asks for. Returns whether it is.
     pub(crate) fn end_by(&self, unit_id: u8, request: &Result<Request<'_>, ExceptionCode>) -> bool {
-        let Ok(Request::Diagnostics(asked)) = request else { return false };
-        let ends = asked.sub_function() == SubFunction::RestartCommunications;
+        let Ok(Request::Diagnostics(query)) = request else { return false };
+        let ends = query.sub_function() == SubFunction::RestartCommunications;
         if ends {
             self.units[usize::from(unit_id)].store(false, Ordering::Relaxed);
         }

@@ -28,7 +28,7 @@ use crate::server::requests::{fifo_queue, file_records, journaled_write};
 use crate::server::requests::{reading, writing};
 use crate::server::rights::functions::is_write;
 use crate::server::rights::peer_rights::PeerRights;
-use crate::server::rights::rule::Elsewhere;
+use crate::server::rights::rule::RequestDestination;
 
 /// What all units of a listener do.
 #[derive(Debug, Clone, Copy, Default)]
@@ -75,22 +75,22 @@ impl UnitServer {
     }
 
     /// Carries out a request and writes the reply. Returns its length, or `None` when there is no
-    /// reply. `permit` is asked before a request is carried out that the peer may send; without a permit,
-    /// it could not be recorded, and is refused.
+    /// reply. `can_record` is called before a request is carried out that the peer may send, and makes room for
+    /// its record; without room, the request is refused.
     #[inline]
     pub fn answer(
         &self,
         rights: &PeerRights,
         unit_id: u8,
         request: &[u8],
-        permit: impl FnOnce() -> bool,
+        can_record: impl FnOnce() -> bool,
         reply: &mut Buffer,
     ) -> Option<usize> {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
         let logs = self.comm_events.is_on();
         let was_silent = logs && self.receive(unit_id);
-        let served = self.serve(rights, unit_id, (function_code, request), permit, reply);
+        let served = self.serve(rights, unit_id, (function_code, request), can_record, reply);
         if logs {
             self.note_served(unit_id, request, was_silent, &served);
         }
@@ -148,78 +148,78 @@ impl UnitServer {
         self.comm_events.receive(Received::Error);
     }
 
-    /// Where a request goes that is not answered here.
+    /// Where a request goes that is not answered here; `None` if it is.
     #[inline]
-    pub(crate) fn elsewhere<'r>(
+    pub(crate) fn destination<'r>(
         &self,
         rights: &'r PeerRights,
         unit_id: u8,
         request: &[u8],
-    ) -> Option<&'r Elsewhere> {
-        let places = rights.elsewhere(unit_id)?;
-        self.find_destination(places, unit_id, request)
+    ) -> Option<&'r RequestDestination> {
+        let destinations = rights.destinations(unit_id)?;
+        self.find_destination(destinations, unit_id, request)
     }
 
-    /// The first place that accepts a request. Not inline: most units have no such places.
+    /// The first destination that accepts a request. Not inline: most units have none.
     #[inline(never)]
     fn find_destination<'r>(
         &self,
-        places: &'r [Elsewhere],
+        destinations: &'r [RequestDestination],
         unit_id: u8,
         request: &[u8],
-    ) -> Option<&'r Elsewhere> {
-        places.iter().find(|place| match place {
-            Elsewhere::Device(_) => !self.listen_only.refuses(request),
-            Elsewhere::Mirror(passage) => {
+    ) -> Option<&'r RequestDestination> {
+        destinations.iter().find(|destination| match destination {
+            RequestDestination::Device(_) => !self.listen_only.refuses(request),
+            RequestDestination::Mirror(passage) => {
                 !self.listen_only.is_on(unit_id) && passage.accepts(request)
             }
-            Elsewhere::Journal(_) => !self.listen_only.is_on(unit_id) && is_write(request),
+            RequestDestination::Journal(_) => !self.listen_only.is_on(unit_id) && is_write(request),
         })
     }
 
-    /// Sends a request on its way to a device or a journal. Returns also the name of the device. `permit`
-    /// is asked as by `answer`.
+    /// Sends a request on its way to a device or a journal. Returns also the name of the device.
+    /// `can_record` is called as by `answer`.
     ///
     /// # Errors
     /// The exception to answer it with.
     pub(crate) fn forward(
         &self,
         rights: &PeerRights,
-        place: &Elsewhere,
+        destination: &RequestDestination,
         asker: &Asker,
         unit_id: u8,
         request: &[u8],
-        permit: &mut dyn FnMut() -> bool,
+        can_record: &mut dyn FnMut() -> bool,
     ) -> Result<(Option<Arc<str>>, PendingReply), ExceptionCode> {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
         self.comm_events.receive(Received::Request { silent: false });
-        let sent = match place {
+        let sent = match destination {
             _ if !rights.allows(unit_id, function_code) => Err(NOT_ALLOWED),
             // A gateway may put it on a line, whose devices could read it as several requests: with
             // functions, and for units, that the peer may not use.
-            Elsewhere::Device(_) if !pdu::may_be_passed_on(request) => {
+            RequestDestination::Device(_) if !pdu::may_be_passed_on(request) => {
                 Err(ExceptionCode::IllegalDataValue)
             }
-            Elsewhere::Device(_) if rights.denies(unit_id, request) => Err(NOT_ALLOWED),
-            Elsewhere::Mirror(passage) if outside(rights, unit_id, request) => {
+            RequestDestination::Device(_) if rights.denies(unit_id, request) => Err(NOT_ALLOWED),
+            RequestDestination::Mirror(passage) if exceeds_ranges(rights, unit_id, request) => {
                 Err(out_of_ranges(&passage.memory))
             }
-            Elsewhere::Journal(memory) if outside(rights, unit_id, request) => {
+            RequestDestination::Journal(memory) if exceeds_ranges(rights, unit_id, request) => {
                 Err(out_of_ranges(memory))
             }
-            _ if !permit() => Err(match place {
-                Elsewhere::Journal(_) => Request::parse(request).err(),
+            _ if !can_record() => Err(match destination {
+                RequestDestination::Journal(_) => Request::parse(request).err(),
                 _ => None,
             }
             .unwrap_or(ExceptionCode::ServerDeviceFailure)),
-            Elsewhere::Device(route) => route
+            RequestDestination::Device(route) => route
                 .ask(asker, unit_id, request)
                 .map(|pending| (Some(Arc::clone(&route.name)), pending)),
-            Elsewhere::Mirror(passage) => {
+            RequestDestination::Mirror(passage) => {
                 passage.ask(request).map(|(device, pending)| (Some(device), pending))
             }
-            Elsewhere::Journal(memory) => {
+            RequestDestination::Journal(memory) => {
                 journaled_write::submit(memory, request).map(|pending| (None, pending))
             }
         };
@@ -254,7 +254,7 @@ impl UnitServer {
         rights: &PeerRights,
         unit_id: u8,
         (function_code, pdu): (u8, &[u8]),
-        permit: impl FnOnce() -> bool,
+        can_record: impl FnOnce() -> bool,
         reply: &mut Buffer,
     ) -> Result<Option<usize>, ExceptionCode> {
         let request = Request::parse(pdu);
@@ -277,7 +277,7 @@ impl UnitServer {
         if rights.ranges(unit_id).is_some_and(|ranges| !ranges.allow(&request)) {
             return Err(out_of_ranges(memory));
         }
-        if !permit() {
+        if !can_record() {
             return Err(ExceptionCode::ServerDeviceFailure);
         }
         match request {
@@ -332,8 +332,8 @@ impl UnitServer {
                 done.map_err(exception_of).map(|()| len)
             }
             _ if memory.sealed() => Err(ExceptionCode::ServerDeviceBusy),
-            Request::Diagnostics(asked) => {
-                return Ok(self.diagnose(unit_id, asked, reply));
+            Request::Diagnostics(query) => {
+                return Ok(self.diagnose(unit_id, query, reply));
             }
             Request::GetCommEventCounter => {
                 Ok(reply::event_counter(false, self.counters.bus().events as u16, reply))
@@ -368,23 +368,23 @@ impl UnitServer {
     }
 
     /// Function 8. The counters are those of the listener; their low 16 bits are sent.
-    fn diagnose(&self, unit_id: u8, asked: Diagnostics<'_>, reply: &mut Buffer) -> Option<usize> {
+    fn diagnose(&self, unit_id: u8, query: Diagnostics<'_>, reply: &mut Buffer) -> Option<usize> {
         let bus = self.counters.bus();
-        let count = match asked.sub_function() {
+        let count = match query.sub_function() {
             // Each connection and line has a delimiter of its own, see `changed_delimiter`.
             SubFunction::ReturnQueryData | SubFunction::ChangeAsciiInputDelimiter => {
-                return Some(reply::diagnostics_echo(asked, reply));
+                return Some(reply::diagnostics_echo(query, reply));
             }
             SubFunction::RestartCommunications | SubFunction::ClearCounters => {
                 self.counters.clear_bus(Bus { events: 1, ..Bus::default() });
-                return Some(reply::diagnostics_echo(asked, reply));
+                return Some(reply::diagnostics_echo(query, reply));
             }
             SubFunction::ForceListenOnlyMode => {
                 self.listen_only.begin(unit_id);
                 return None;
             }
             // This server has no overruns and sends no negative acknowledge.
-            SubFunction::ClearOverrunCounter => return Some(reply::diagnostics_echo(asked, reply)),
+            SubFunction::ClearOverrunCounter => return Some(reply::diagnostics_echo(query, reply)),
             SubFunction::ReturnServerNakCount
             | SubFunction::ReturnBusCharacterOverrunCount
             | SubFunction::ReturnDiagnosticRegister => 0,
@@ -395,12 +395,12 @@ impl UnitServer {
             SubFunction::ReturnServerNoResponseCount => bus.no_response,
             SubFunction::ReturnServerBusyCount => bus.busy,
         };
-        Some(reply::diagnostics(asked.sub_function(), count as u16, reply))
+        Some(reply::diagnostics(query.sub_function(), count as u16, reply))
     }
 }
 
-/// Whether a request reads or writes what the rights of a peer leave out.
-pub(super) fn outside(rights: &PeerRights, unit_id: u8, request: &[u8]) -> bool {
+/// Whether a request reads or writes anything outside the ranges of a peer.
+pub(super) fn exceeds_ranges(rights: &PeerRights, unit_id: u8, request: &[u8]) -> bool {
     rights
         .ranges(unit_id)
         .is_some_and(|ranges| Request::parse(request).is_ok_and(|request| !ranges.allow(&request)))

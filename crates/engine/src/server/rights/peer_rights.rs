@@ -11,7 +11,7 @@ use crate::server::rights::functions::{
     AccessMode, Answerer, Codes, Functions, is_other_interface, only_reads,
 };
 use crate::server::rights::ranges::Ranges;
-use crate::server::rights::rule::{Elsewhere, Rule};
+use crate::server::rights::rule::{RequestDestination, Rule};
 
 /// The rights of a peer, compiled to a table by unit id.
 #[derive(Debug)]
@@ -25,9 +25,9 @@ pub struct PeerRights {
 struct UnitRights {
     /// `None` if all requests go elsewhere.
     memory: Option<Arc<Memory>>,
-    /// Where requests may go; the first place that takes one gets it. `None` if the memory answers
+    /// Where requests may go; the first destination that takes one gets it. `None` if the memory answers
     /// everything.
-    places: Option<Box<[Elsewhere]>>,
+    destinations: Option<Box<[RequestDestination]>>,
     functions: Codes,
     /// Whether function 43 was listed: a device gets it with any MEI type then.
     lists_interface: bool,
@@ -44,7 +44,7 @@ impl UnitRights {
         rule: &Rule,
         unit_id: u8,
         memory: Option<Arc<Memory>>,
-        elsewhere: Option<Elsewhere>,
+        destination: Option<RequestDestination>,
     ) -> (UnitRights, Codes) {
         let narrowed = rule.narrowed.iter().find(|(narrowed, _)| *narrowed == unit_id);
         let (access, allowed, ranges, exception_status, queues) = match narrowed {
@@ -56,8 +56,8 @@ impl UnitRights {
                 (own.access, &own.functions, ranges, own.exception_status, queues)
             }
         };
-        let answerer = match elsewhere {
-            Some(Elsewhere::Device(_)) => Answerer::Device,
+        let answerer = match destination {
+            Some(RequestDestination::Device(_)) => Answerer::Device,
             _ => Answerer::Memory {
                 exception_status: exception_status.is_some(),
                 files: memory.as_ref().is_some_and(|memory| memory.layout().has_files()),
@@ -74,12 +74,12 @@ impl UnitRights {
             Answerer::Device => Codes::of(allowed, access, Answerer::PLAIN_MEMORY),
         };
         let journal = memory.as_ref().filter(|memory| memory.has_journal()).cloned();
-        let places: Box<[_]> =
-            elsewhere.into_iter().chain(journal.map(Elsewhere::Journal)).collect();
-        let places = (!places.is_empty()).then_some(places);
+        let destinations: Box<[_]> =
+            destination.into_iter().chain(journal.map(RequestDestination::Journal)).collect();
+        let destinations = (!destinations.is_empty()).then_some(destinations);
         let unit = UnitRights {
             memory,
-            places,
+            destinations,
             functions,
             lists_interface,
             access,
@@ -106,23 +106,24 @@ impl PeerRights {
         let mut units = Box::new([const { None }; 256]);
         let mut functions = Codes::default();
         for rule in rules {
-            let mut own: BTreeMap<u8, (Option<Arc<Memory>>, Option<Elsewhere>)> = BTreeMap::new();
+            let mut own: BTreeMap<u8, (Option<Arc<Memory>>, Option<RequestDestination>)> =
+                BTreeMap::new();
             for (unit, memory) in &rule.units {
                 own.entry(*unit).or_default().0 = Some(Arc::clone(memory));
             }
-            for (unit, place) in &rule.elsewhere {
-                own.entry(*unit).or_default().1 = Some(place.clone());
+            for (unit, destination) in &rule.destinations {
+                own.entry(*unit).or_default().1 = Some(destination.clone());
             }
-            for (unit_id, (memory, elsewhere)) in own {
+            for (unit_id, (memory, destination)) in own {
                 let place = &mut units[usize::from(unit_id)];
                 if place.is_some() {
                     continue;
                 }
-                let (unit, known) = UnitRights::new(rule, unit_id, memory, elsewhere);
+                let (unit, known) = UnitRights::new(rule, unit_id, memory, destination);
                 functions = functions.with(known);
                 *place = Some(unit);
             }
-            if rule.units.is_empty() && rule.elsewhere.is_empty() {
+            if rule.units.is_empty() && rule.destinations.is_empty() {
                 functions =
                     functions.with(Codes::of(&rule.functions, rule.access, Answerer::PLAIN_MEMORY));
             }
@@ -143,8 +144,8 @@ impl PeerRights {
 
     /// Where requests to a unit id go, or some of them.
     #[inline]
-    pub(crate) fn elsewhere(&self, unit_id: u8) -> Option<&[Elsewhere]> {
-        self.unit(unit_id)?.places.as_deref()
+    pub(crate) fn destinations(&self, unit_id: u8) -> Option<&[RequestDestination]> {
+        self.unit(unit_id)?.destinations.as_deref()
     }
 
     /// The ranges that requests to a unit id must be inside, if they are limited.

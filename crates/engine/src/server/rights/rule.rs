@@ -19,7 +19,7 @@ pub struct Rule {
     pub roles: Option<Vec<String>>,
     pub units: Vec<(u8, Arc<Memory>)>,
     /// Units whose requests, or some of them, go to devices.
-    pub elsewhere: Vec<(u8, Elsewhere)>,
+    pub destinations: Vec<(u8, RequestDestination)>,
     pub access: AccessMode,
     pub functions: Functions,
     /// Units with rights of their own, in place of those of the rule.
@@ -40,7 +40,7 @@ pub struct Narrowed {
 
 /// Where requests to a unit go that its memory does not answer.
 #[derive(Debug, Clone)]
-pub enum Elsewhere {
+pub enum RequestDestination {
     /// All go to a device. The unit has no memory.
     Device(Route),
     /// Writes into some ranges of its memory are passed on.
@@ -49,13 +49,13 @@ pub enum Elsewhere {
     Journal(Arc<Memory>),
 }
 
-impl Elsewhere {
+impl RequestDestination {
     /// The memory of the unit; `None` if it is a device.
     pub(crate) fn memory(&self) -> Option<&Memory> {
         match self {
-            Elsewhere::Device(_) => None,
-            Elsewhere::Mirror(passage) => Some(&passage.memory),
-            Elsewhere::Journal(memory) => Some(memory),
+            RequestDestination::Device(_) => None,
+            RequestDestination::Mirror(passage) => Some(&passage.memory),
+            RequestDestination::Journal(memory) => Some(memory),
         }
     }
 }

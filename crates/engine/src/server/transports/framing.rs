@@ -34,31 +34,31 @@ pub(crate) enum Next<'a> {
 pub(crate) trait Framing: Send + Sync + 'static {
     /// Where [`Framing::complete`] takes the PDU from: bytes before it.
     const HEADER_LEN: usize;
-    /// The shortest request.
-    const SHORTEST: usize;
-    /// The longest frame.
+    /// The length of the shortest request.
+    const MIN_FRAME_LEN: usize;
+    /// The length of the longest frame.
     const MAX_LEN: usize;
     /// Whether a reply names its request. Otherwise, a late one is taken for the reply to the next request.
     const HAS_IDS: bool;
 
-    /// What is known of the bytes before those that are looked at.
-    type Before: Default + Send;
+    /// What is remembered of the bytes before those that are looked at.
+    type ParserState: Default + Send;
 
-    /// Room for a decoded frame, where the PDU is not in the frame as it is.
+    /// A buffer for a decoded frame, where the PDU is not in the frame as it is.
     type Decoded;
-    const NOT_DECODED: Self::Decoded;
+    const EMPTY_DECODED: Self::Decoded;
 
     /// Looks at the start of `bytes`. An incomplete frame is never longer than
     /// [`Framing::MAX_LEN`]. `delimiter` returns the last character of an ASCII frame.
     fn next<'a>(
-        before: &mut Self::Before,
+        state: &mut Self::ParserState,
         bytes: &'a [u8],
         delimiter: impl FnOnce() -> u8,
         decoded: &'a mut Self::Decoded,
     ) -> Next<'a>;
 
     /// Whether the next byte starts a frame, even if no silence precedes it.
-    fn is_at_start(_before: &Self::Before) -> bool {
+    fn is_at_start(_state: &Self::ParserState) -> bool {
         true
     }
 
@@ -71,7 +71,7 @@ pub(crate) trait Framing: Send + Sync + 'static {
 pub(crate) trait Datagram: Framing {
     /// The request that a datagram consists of. Anything else is never [`Next::Request`], nor
     /// [`Next::Incomplete`]: nothing follows a datagram.
-    fn only(datagram: &[u8]) -> Next<'_>;
+    fn single_request(datagram: &[u8]) -> Next<'_>;
 }
 
 /// Frames with an MBAP header.
@@ -85,18 +85,18 @@ pub(crate) struct MbapOnPort<const HAS_PACKETS: bool>;
 
 impl<const HAS_PACKETS: bool> Framing for MbapOnPort<HAS_PACKETS> {
     const HEADER_LEN: usize = mbap::HEADER_LEN;
-    const SHORTEST: usize = mbap::HEADER_LEN + 1;
+    const MIN_FRAME_LEN: usize = mbap::HEADER_LEN + 1;
     const MAX_LEN: usize = mbap::MAX_LEN;
     const HAS_IDS: bool = true;
 
-    type Before = ();
+    type ParserState = ();
 
     type Decoded = ();
-    const NOT_DECODED: () = ();
+    const EMPTY_DECODED: () = ();
 
     #[inline]
     fn next<'a>(
-        _before: &mut (),
+        _state: &mut (),
         bytes: &'a [u8],
         _delimiter: impl FnOnce() -> u8,
         _decoded: &'a mut (),
@@ -129,7 +129,7 @@ fn mbap_next(bytes: &[u8]) -> Next<'_> {
 
 impl Datagram for Mbap {
     #[inline]
-    fn only(datagram: &[u8]) -> Next<'_> {
+    fn single_request(datagram: &[u8]) -> Next<'_> {
         match mbap_next(datagram) {
             Next::Request { len, .. } if len < datagram.len() => Next::Broken,
             Next::Incomplete => Next::Broken,
@@ -143,22 +143,22 @@ pub(crate) struct Rtu;
 
 impl Framing for Rtu {
     const HEADER_LEN: usize = 1;
-    const SHORTEST: usize = 4;
+    const MIN_FRAME_LEN: usize = 4;
     const MAX_LEN: usize = rtu::MAX_LEN;
     const HAS_IDS: bool = false;
 
-    type Before = rtu_stream::Requests;
+    type ParserState = rtu_stream::Requests;
 
     type Decoded = ();
-    const NOT_DECODED: () = ();
+    const EMPTY_DECODED: () = ();
 
     fn next<'a>(
-        before: &mut rtu_stream::Requests,
+        state: &mut rtu_stream::Requests,
         bytes: &'a [u8],
         _delimiter: impl FnOnce() -> u8,
         _decoded: &'a mut (),
     ) -> Next<'a> {
-        match before.next(bytes) {
+        match state.next(bytes) {
             rtu_stream::Next::Incomplete => Next::Incomplete,
             rtu_stream::Next::Frame { unit_id, pdu, len } => {
                 Next::Request { tag: 0, unit_id, pdu, len }
@@ -168,8 +168,8 @@ impl Framing for Rtu {
         }
     }
 
-    fn is_at_start(before: &rtu_stream::Requests) -> bool {
-        before.is_at_start()
+    fn is_at_start(state: &rtu_stream::Requests) -> bool {
+        state.is_at_start()
     }
 
     fn complete(frame: &mut [u8], _tag: u16, unit_id: u8, pdu_len: usize) -> usize {
@@ -183,7 +183,7 @@ impl Framing for Rtu {
 
 impl Datagram for Rtu {
     /// The end of the datagram is the end of the frame, whatever its function code.
-    fn only(datagram: &[u8]) -> Next<'_> {
+    fn single_request(datagram: &[u8]) -> Next<'_> {
         match rtu::decode(datagram) {
             Ok((unit_id, pdu)) => Next::Request { tag: 0, unit_id, pdu, len: datagram.len() },
             Err(_) => Next::Damaged { len: datagram.len() },
@@ -198,17 +198,17 @@ impl Framing for Ascii {
     /// The colon and the digits of the unit id.
     const HEADER_LEN: usize = 3;
     /// A function code without data.
-    const SHORTEST: usize = 1 + 2 * 3 + 2;
+    const MIN_FRAME_LEN: usize = 1 + 2 * 3 + 2;
     const MAX_LEN: usize = ascii::MAX_LEN;
     const HAS_IDS: bool = false;
 
-    type Before = ();
+    type ParserState = ();
 
     type Decoded = [u8; ascii::MAX_BODY_LEN];
-    const NOT_DECODED: Self::Decoded = [0; ascii::MAX_BODY_LEN];
+    const EMPTY_DECODED: Self::Decoded = [0; ascii::MAX_BODY_LEN];
 
     fn next<'a>(
-        _before: &mut (),
+        _state: &mut (),
         bytes: &'a [u8],
         delimiter: impl FnOnce() -> u8,
         decoded: &'a mut Self::Decoded,

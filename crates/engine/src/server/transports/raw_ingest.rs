@@ -31,7 +31,7 @@ use crate::raw_ingest_areas::of_packet;
 use crate::server::connections::admission::{ConnectionLimits, Ticket};
 use crate::server::connections::closing::drain;
 use crate::server::connections::listener::{
-    Admitted, KEEPALIVE, ListenerContext, Service, Serving, set_options,
+    Admitted, KEEPALIVE, ListenerContext, Service, Serving, set_tcp_options,
 };
 use crate::server::connections::peer::Peer;
 use crate::server::connections::reloadable::Reloadable;
@@ -293,7 +293,7 @@ impl RawIngest {
         stop: watch::Receiver<bool>,
     ) {
         if let Some(tls) = &self.tls {
-            set_options(&connection.stream, KEEPALIVE);
+            set_tcp_options(&connection.stream, KEEPALIVE);
             // In a box of its own, so that plain connections do not reserve memory for it.
             return Box::pin(self.secure(tls, live, context, connection, stop)).await;
         }

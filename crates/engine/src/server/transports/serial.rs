@@ -213,7 +213,7 @@ impl ModbusSerial {
     /// Whether frames for a unit id are requests to this listener.
     fn is_served(&self, unit_id: u8) -> bool {
         let rights = self.rights.get();
-        let is_known = rights.memory(unit_id).is_some() || rights.elsewhere(unit_id).is_some();
+        let is_known = rights.memory(unit_id).is_some() || rights.destinations(unit_id).is_some();
         is_known || unit_id == BROADCAST
     }
 
@@ -320,10 +320,10 @@ impl ModbusSerial {
             return None;
         }
         let rights = self.rights.get();
-        if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
+        if let Some(destination) = self.unit_server.destination(&rights, unit_id, request) {
             let asker = Asker { source: self.source, peer: None };
-            let asked = Asked::send(context, place, (0, unit_id, request), |permit| {
-                self.unit_server.forward(&rights, place, &asker, unit_id, request, permit)
+            let asked = Asked::send(context, destination, (0, unit_id, request), |can_record| {
+                self.unit_server.forward(&rights, destination, &asker, unit_id, request, can_record)
             });
             let (asked, answered, refused) = asked;
             context.note_refused(refused, &self.reported, None);

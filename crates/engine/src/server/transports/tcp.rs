@@ -12,7 +12,7 @@ use crate::server::connections::admission::{ConnectionLimits, Ticket};
 use crate::server::connections::connection::{Connection, Renewal, Terms};
 use crate::server::connections::deadlines::Timeouts;
 use crate::server::connections::listener::{
-    Admitted, ListenerContext, Service, Serving, set_options,
+    Admitted, ListenerContext, Service, Serving, set_tcp_options,
 };
 use crate::server::connections::peer::Peer;
 use crate::server::connections::reloadable::Reloadable;
@@ -269,7 +269,7 @@ impl Service for ModbusStream {
         connection: Admitted<PeerRights>,
         stop: watch::Receiver<bool>,
     ) -> Serving {
-        set_options(&connection.stream, self.keepalive);
+        set_tcp_options(&connection.stream, self.keepalive);
         if self.raw_ingest.is_some() {
             return Box::pin(self.shared(live, context, connection, stop));
         }

@@ -42,7 +42,7 @@ const MAX_LAST_READS: usize = 1024;
 /// The most requests of a listener that wait for devices.
 const MAX_PENDING_REPLIES: usize = 1024;
 
-/// The longest frame of any framing of datagrams.
+/// The longest frame of the framings that datagrams have.
 const MAX_FRAME_LEN: usize = mbap::MAX_LEN;
 
 const _: () = assert!(rtu::MAX_LEN <= MAX_FRAME_LEN);
@@ -101,7 +101,7 @@ impl ModbusUdp {
         mut stop: watch::Receiver<bool>,
     ) {
         let mut input = vec![0; INPUT_BYTES].into_boxed_slice();
-        let mut later = Later::new(stop.clone());
+        let mut pending_replies = PendingReplies::new(stop.clone());
         let mut turns = 0;
         loop {
             turns += 1;
@@ -113,8 +113,8 @@ impl ModbusUdp {
             let ready = tokio::select! {
                 biased;
                 _ = stop.wait_for(|stop| *stop) => break,
-                Some(Ok(completed)) = later.replies.join_next(), if !later.replies.is_empty() => {
-                    complete::<D>(&socket, completed, &mut later);
+                Some(Ok(completed)) = pending_replies.replies.join_next(), if !pending_replies.replies.is_empty() => {
+                    complete::<D>(&socket, completed, &mut pending_replies);
                     continue;
                 }
                 ready = socket.socket.readable() => ready,
@@ -124,19 +124,19 @@ impl ModbusUdp {
                 socket.socket.try_io(Interest::READABLE, || socket.receive(&mut input))
             });
             if let Ok(meta) = received {
-                self.take::<D>(context, &socket, &meta, &input, &mut later);
+                self.take::<D>(context, &socket, &meta, &input, &mut pending_replies);
             }
         }
         for _ in 0..MAX_LAST_READS {
             match socket.receive(&mut input) {
-                Ok(meta) => self.take::<D>(context, &socket, &meta, &input, &mut later),
+                Ok(meta) => self.take::<D>(context, &socket, &meta, &input, &mut pending_replies),
                 Err(error) if error.kind() == ErrorKind::WouldBlock => break,
                 Err(_) => {}
             }
         }
         // The engine drops listeners whose devices take too long.
-        while let Some(Ok(completed)) = later.replies.join_next().await {
-            complete::<D>(&socket, completed, &mut later);
+        while let Some(Ok(completed)) = pending_replies.replies.join_next().await {
+            complete::<D>(&socket, completed, &mut pending_replies);
         }
     }
 
@@ -147,13 +147,13 @@ impl ModbusUdp {
         socket: &Datagrams,
         meta: &RecvMeta,
         input: &[u8],
-        later: &mut Later,
+        pending_replies: &mut PendingReplies,
     ) {
         let mut output = [0; MAX_FRAME_LEN];
         let mut rest = &input[..meta.len];
         loop {
             let (datagram, more) = rest.split_at(meta.stride.min(rest.len()));
-            let len = self.answer::<D>(context, meta, datagram, &mut output, later);
+            let len = self.answer::<D>(context, meta, datagram, &mut output, pending_replies);
             if len > 0 {
                 socket.send(&output[..len], meta);
             }
@@ -171,14 +171,14 @@ impl ModbusUdp {
         meta: &RecvMeta,
         datagram: &[u8],
         output: &mut [u8; MAX_FRAME_LEN],
-        later: &mut Later,
+        pending_replies: &mut PendingReplies,
     ) -> usize {
         let peer = meta.addr;
         let Some(rights) = self.policy.get().rights(peer.ip(), None) else {
             context.report(Kind::RefusedSource, Some(peer.into()));
             return 0;
         };
-        let (tag, unit_id, request) = match D::only(datagram) {
+        let (tag, unit_id, request) = match D::single_request(datagram) {
             // The exception of another server. After one request with a forged address, two servers would
             // answer each other's exceptions without end.
             Next::Request { pdu: [0x80..=0xFF, ..], .. } => {
@@ -202,33 +202,37 @@ impl ModbusUdp {
         let Some(buffer) = output[D::HEADER_LEN..].first_chunk_mut::<{ pdu::MAX_LEN }>() else {
             return 0;
         };
-        if let Some((newest, _)) = later.newest.get(&peer) {
+        if let Some((newest, _)) = pending_replies.newest.get(&peer) {
             newest.send_replace(Instant::now());
         }
-        if D::HAS_IDS && later.repeats(peer, (tag, unit_id, request)) {
+        if D::HAS_IDS && pending_replies.repeats(peer, (tag, unit_id, request)) {
             return 0;
         }
-        if let Some(place) = self.unit_server.elsewhere(&rights, unit_id, request) {
-            let asker = later.asker(peer.ip());
-            let asked = Asked::send(context, place, (tag, unit_id, request), |permit| {
-                if later.is_full(peer.ip()) {
+        if let Some(destination) = self.unit_server.destination(&rights, unit_id, request) {
+            let asker = pending_replies.asker(peer.ip());
+            let asked = Asked::send(context, destination, (tag, unit_id, request), |can_record| {
+                if pending_replies.is_full(peer.ip()) {
                     return Err(ExceptionCode::ServerDeviceBusy);
                 }
-                self.unit_server.forward(&rights, place, &asker, unit_id, request, permit)
+                self.unit_server.forward(&rights, destination, &asker, unit_id, request, can_record)
             });
             let (asked, reply, refused) = asked;
             context.note_refused(refused, &Reported::default(), Some(&peer.into()));
             return match reply {
                 Expected::Pending(pending) => {
                     let ours = (Arc::clone(&self.unit_server), Arc::clone(context));
-                    let reply =
-                        asked.answered(pending, ours, Some(peer.into()), later.running.clone());
+                    let reply = asked.answered(
+                        pending,
+                        ours,
+                        Some(peer.into()),
+                        pending_replies.running.clone(),
+                    );
                     let now = Instant::now();
                     let sent = Sent { asked: now, unit_id, request: request.to_vec(), times: 1 };
-                    later.sent.insert((peer, tag), sent);
+                    pending_replies.sent.insert((peer, tag), sent);
                     let pending =
                         Completed { meta: *meta, asked: now, tag, unit_id, pdu: Vec::new() };
-                    later.begin(&asker, pending, D::HAS_IDS, reply);
+                    pending_replies.begin(&asker, pending, D::HAS_IDS, reply);
                     0
                 }
                 Expected::Known(reply) => {
@@ -245,8 +249,8 @@ impl ModbusUdp {
     }
 }
 
-/// Requests whose replies come later.
-struct Later {
+/// Requests that wait for their replies.
+struct PendingReplies {
     /// The clients that wait for replies.
     clients: HashMap<IpAddr, Client>,
     /// For each peer that waits, when its newest request came, and for how many replies it waits.
@@ -272,10 +276,10 @@ struct Client {
     waiting: usize,
 }
 
-impl Later {
-    fn new(running: watch::Receiver<bool>) -> Later {
+impl PendingReplies {
+    fn new(running: watch::Receiver<bool>) -> PendingReplies {
         let (clients, newest, sent) = (HashMap::new(), HashMap::new(), HashMap::new());
-        Later { clients, newest, sent, replies: JoinSet::new(), running }
+        PendingReplies { clients, newest, sent, replies: JoinSet::new(), running }
     }
 
     fn asker(&self, address: IpAddr) -> Asker {
@@ -379,12 +383,16 @@ struct Completed {
 }
 
 /// Sends the reply of a device.
-fn complete<D: Datagram>(socket: &Datagrams, completed: Completed, later: &mut Later) {
+fn complete<D: Datagram>(
+    socket: &Datagrams,
+    completed: Completed,
+    pending_replies: &mut PendingReplies,
+) {
     let Completed { meta, asked, tag, unit_id, pdu } = completed;
     // It may have asked again just when the reply came.
-    let is_late = !D::HAS_IDS && later.has_asked_again(meta.addr, asked);
-    later.end(meta.addr);
-    let times = later.times(meta.addr, tag, asked);
+    let is_late = !D::HAS_IDS && pending_replies.has_asked_again(meta.addr, asked);
+    pending_replies.end(meta.addr);
+    let times = pending_replies.times(meta.addr, tag, asked);
     if !pdu.is_empty() && !is_late {
         let mut frame = [0; MAX_FRAME_LEN];
         frame[D::HEADER_LEN..][..pdu.len()].copy_from_slice(&pdu);
@@ -451,40 +459,40 @@ mod tests {
         let [one, other] = [1, 2].map(|last| IpAddr::from([127, 0, 0, last]));
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
         let _context = runtime.enter();
-        let mut later = Later::new(watch::channel(false).1);
-        let first = later.asker(one);
+        let mut pending_replies = PendingReplies::new(watch::channel(false).1);
+        let first = pending_replies.asker(one);
         let peer = SocketAddr::from((one, 1));
-        later.begin(&first, unanswered(peer), false, std::future::pending());
-        while !later.is_full(one) {
-            let asker = later.asker(one);
+        pending_replies.begin(&first, unanswered(peer), false, std::future::pending());
+        while !pending_replies.is_full(one) {
+            let asker = pending_replies.asker(one);
             assert_eq!(asker.source, first.source);
-            later.begin(&asker, unanswered(peer), false, std::future::pending());
+            pending_replies.begin(&asker, unanswered(peer), false, std::future::pending());
         }
-        assert_eq!(later.replies.len(), MAX_PENDING_REPLIES / 2);
-        let asker = later.asker(other);
-        assert_eq!((later.waiting(other), later.is_full(other)), (0, false));
+        assert_eq!(pending_replies.replies.len(), MAX_PENDING_REPLIES / 2);
+        let asker = pending_replies.asker(other);
+        assert_eq!((pending_replies.waiting(other), pending_replies.is_full(other)), (0, false));
         assert_ne!(asker.source, first.source);
-        (0..later.waiting(one)).for_each(|_| later.end(peer));
-        assert!(later.clients.is_empty() && later.newest.is_empty());
+        (0..pending_replies.waiting(one)).for_each(|_| pending_replies.end(peer));
+        assert!(pending_replies.clients.is_empty() && pending_replies.newest.is_empty());
     }
 
     #[test]
     fn a_peer_that_asks_again_after_a_pause_has_given_up_the_replies_before() {
         let [one, other] = [1, 2].map(|port| SocketAddr::from(([127, 0, 0, 1], port)));
         let runtime = tokio::runtime::Builder::new_current_thread().build().unwrap();
-        let mut later = Later::new(watch::channel(false).1);
-        let asker = later.asker(one.ip());
+        let mut pending_replies = PendingReplies::new(watch::channel(false).1);
+        let asker = pending_replies.asker(one.ip());
         let given_up: Vec<_> = runtime.block_on(async {
             for (peer, has_ids) in [(other, false), (one, true), (one, false)] {
-                later.begin(&asker, unanswered(peer), has_ids, std::future::pending());
+                pending_replies.begin(&asker, unanswered(peer), has_ids, std::future::pending());
             }
             let first = Instant::now();
             for asked_again in [first, first + BURST_TIME * 2] {
-                later.newest[&one].0.send_replace(asked_again);
+                pending_replies.newest[&one].0.send_replace(asked_again);
                 yield_now().await;
             }
             yield_now().await;
-            std::iter::from_fn(|| later.replies.try_join_next()).collect()
+            std::iter::from_fn(|| pending_replies.replies.try_join_next()).collect()
         });
         assert_eq!(given_up.len(), 1);
         assert_eq!(given_up[0].as_ref().unwrap().meta.addr, one);
@@ -510,7 +518,7 @@ mod tests {
             sources: vec!["127.0.0.1/32".parse().unwrap()],
             roles: None,
             units: vec![(1, Arc::new(Memory::new(layout, None).unwrap()))],
-            elsewhere: Vec::new(),
+            destinations: Vec::new(),
             access: AccessMode::ReadOnly,
             functions: Functions::All,
             narrowed: Vec::new(),
