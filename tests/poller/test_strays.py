@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from holdfast.config import load
 from holdfast.events import log_lines
 from support import web, wire
 from support.polled import (
@@ -24,8 +25,10 @@ from support.polled import (
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from holdfast.appliance import Appliance
+    from holdfast.config import Config
     from support.running import Run
 
 FLOODED = 0x8008
@@ -88,6 +91,44 @@ def test_what_follows_a_reply_is_counted_and_reaches_no_memory(
     [event] = records.of("unrequested_data")
     assert event["device"] == "meter"
     assert event["bytes"] > 0
+
+
+@pytest.mark.parametrize("becomes", ["added_again", "moved"])
+@pytest.mark.usefixtures("health_is_checked_at_once")
+def test_after_a_reload_unrequested_data_of_another_device_is_logged(
+    becomes: str, tmp_path: Path, run: Run, records: web.Records
+) -> None:
+    sends = threading.Event()
+
+    def twice_when_told(request: wire.Frame) -> bytes:
+        return data(request, 7) * (2 if sends.is_set() else 1)
+
+    def loaded(url: str, **more: Any) -> Config:
+        file = tmp_path / "changed.yaml"
+        file.write_text(configuration({"meter": device(url, *READS, **more)}))
+        return load(file)
+
+    with Fake(lambda request: data(request, 7) * 2) as fake, Fake(twice_when_told) as other:
+        appliance = polled(run, fake.url)
+
+        def is_logged(times: int) -> bool:
+            appliance.log_events(timeout=0.01)
+            return len(records.of("unrequested_data")) == times
+
+        wire.until(lambda: is_logged(1), "it is logged")
+        before = counters(appliance, "meter")["stray_bytes"]
+        if becomes == "added_again":
+            appliance.reload(loaded(fake.url, enabled=False))
+        appliance.reload(loaded(other.url))
+        if becomes == "added_again":
+            # Its counter is higher when it is looked at next.
+            sends.set()
+            until_counted(appliance, "stray_bytes", before + 1)
+        else:
+            wire.until(lambda: counters(appliance, "meter")["stray_bytes"] == 0, "it has moved")
+            assert is_logged(1)
+            sends.set()
+        wire.until(lambda: is_logged(2), "it is logged again")
 
 
 def test_an_unsolicited_frame_before_any_reply_fails_the_request(run: Run) -> None:

@@ -10,7 +10,7 @@ from holdfast.events import log_lines
 from holdfast.polling.faults import fault_word
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from holdfast.config.models.devices import ForwardConfig
 
@@ -34,7 +34,7 @@ class DeviceEvents:
 
     def replace(
         self,
-        gone: Iterable[str],
+        gone: Collection[str],
         polled: Collection[str],
         links: Collection[str],
         refused: Mapping[str, int],
@@ -53,6 +53,7 @@ class DeviceEvents:
         # The poller keeps the counters of a replaced device, except those of its receivers.
         for name in gone:
             self._unstored.pop(name, None)
+        self._strays = {key: at for key, at in self._strays.items() if key[1] not in gone}
         self._forwarded = {key: at for key, at in self._forwarded.items() if key[0] not in names}
         self._unreachable = {key for key in self._unreachable if key[0] not in names}
         self.health |= dict.fromkeys(polled, "unknown")
@@ -110,6 +111,9 @@ class DeviceEvents:
         """Whether a counter has begun to count, or goes on after a while."""
         now, count = time.monotonic(), counted[key[-1]]
         before, since = self._strays.get(key, (0, -_QUIET_S))
+        if count < before:
+            # That of another connection: a reload has changed the address.
+            before, since = self._strays[key] = 0, -_QUIET_S
         if count != before:
             self._strays[key] = (count, now)
         return count > before and now - since >= _QUIET_S
