@@ -1603,25 +1603,6 @@ def test_a_call_that_is_cancelled_in_a_pause_ends_before_it() -> None:
         assert device.requests == []
 
 
-def test_a_connection_without_a_free_transaction_id_is_replaced() -> None:
-    async def main() -> None:
-        with Stream("tcp", good, then=silent) as device:
-            async with holdfast.Client(device.url, timeout=wire.DEADLINE) as plc:
-                await plc.read_coils(0, 1)
-                transport: Any = plc._transport
-                connection, now = transport._last.open, asyncio.get_running_loop().time()
-                request = Request.read("coils", 0, 1)
-                for _ in range(65_536):
-                    connection.cancel(connection.send(request, 1, wire.DEADLINE, now), now)
-                with pytest.raises(holdfast.ConnectionLost, match="no transaction id is free"):
-                    await plc.read_coils(0, 1)
-                device.then = good
-                assert await plc.read_holding_registers(7, 1) == [7]
-                assert device.connections == 2
-
-    run(main)
-
-
 def test_a_pause_before_the_next_connection_may_be_longer_than_the_timeout(dial: Dial) -> None:
     def hang_up(asked: Asked) -> None:
         asked.answer()

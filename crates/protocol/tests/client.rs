@@ -402,15 +402,45 @@ fn an_error_after_a_reply_does_not_affect_the_reply() {
 #[test]
 fn transaction_ids_in_use_are_not_reused() {
     let mut client = Client::new(Transport::Tcp);
-    for _ in 0..65_536 {
-        let ticket = client.send(read());
-        client.cancel(ticket);
+    // The first request stays in flight, the second one is given up.
+    let [_, second] = [(); 2].map(|()| client.send(read()));
+    client.cancel(second);
+    for id in 2..=u16::MAX {
+        client.send(read());
+        client.outgoing();
+        client.receive(&mbap_frame(id, 7, &[3, 2, 0, 1]));
+        assert_eq!(client.got().len(), 1);
     }
-    assert_eq!(client.try_send(read()), Err(Closed::NoTransactionId));
-    client.receive(&mbap_frame(4711, 7, &[3, 2, 0, 1]));
-    client.outgoing();
     client.send(read());
-    assert_eq!(client.outgoing()[..2], 4711u16.to_be_bytes());
+    assert_eq!(client.outgoing()[..2], 2u16.to_be_bytes());
+}
+
+#[test]
+fn of_any_number_of_requests_without_a_reply_those_given_up_last_are_remembered() {
+    let mut client = Client::new(Transport::Tcp);
+    let give_up_more = |client: &mut Client, number: u32| {
+        for _ in 0..number {
+            let ticket = client.send(read());
+            client.outgoing();
+            client.cancel(ticket);
+        }
+    };
+    give_up_more(&mut client, 65_536);
+    // Its id is 0 again. It is given up after all others.
+    let first = client.send(read());
+    assert_eq!(client.outgoing()[..2], 0u16.to_be_bytes());
+    give_up_more(&mut client, 65_535);
+    client.cancel(first);
+    client.send(read());
+    assert_eq!(client.outgoing()[..2], 1u16.to_be_bytes());
+    for (late, id) in [0, u16::MAX, u16::MAX - 4094].into_iter().enumerate() {
+        client.receive(&mbap_frame(id, 7, &[3, 2, 0, 1]));
+        assert_eq!((client.connection.late(), client.connection.closed()), (late as u64 + 1, None));
+    }
+    let forgotten = u16::MAX - 4095;
+    client.receive(&mbap_frame(forgotten, 7, &[3, 2, 0, 1]));
+    let unknown = InvalidResponse::TransactionId(forgotten);
+    assert_eq!(client.connection.closed(), Some(Closed::Invalid(unknown)));
 }
 
 #[test]

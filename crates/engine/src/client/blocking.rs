@@ -476,7 +476,6 @@ impl Open {
         let ticket = match sent {
             Ok(ticket) => ticket,
             Err(why) => {
-                // It is closed, or all transaction ids wait for late replies.
                 call.refused = Some(ClientError::new(why.failure(), timeout));
                 self.connection.close(why, sink);
                 return Ok(());
@@ -615,35 +614,6 @@ mod tests {
             let pdu = client.call(&any_time(), 1, &request, timeout, |_, pdu| pdu.to_vec());
             assert_eq!(pdu.unwrap(), [3, 2, 0, address as u8]);
         }
-    }
-
-    #[test]
-    fn a_connection_without_a_free_transaction_id_ends() {
-        let place = Place::Tcp { host: String::new(), port: 0, tls: None };
-        let client = BlockingClient::new(Endpoint { place, tolerance: Tolerance::default() });
-        let range = Range::new(0, 1).unwrap();
-        let request = EncodedRequest::new(&Request::ReadHoldingRegisters(range));
-        let mut connection = Connection::new(Transport::Tcp);
-        let (timeout, now) = (Duration::from_secs(60), Duration::ZERO);
-        while let Ok(ticket) = connection.send(9, &request, timeout, now) {
-            connection.cancel(ticket, now);
-            connection.sent(connection.outgoing().len());
-        }
-        client.state.lock().unwrap().open = Some(Open {
-            stream: Box::new(Stalled { waiting: VecDeque::new(), copy: None }),
-            peer: None,
-            connection,
-            transport: Transport::Tcp,
-            epoch: client.epoch,
-            used: Instant::now(),
-            late: 0,
-        });
-        let answer = client.call(&any_time(), 1, &request, timeout, |_, _| ());
-        let expected = Lost::Closed(Closed::NoTransactionId);
-        assert!(
-            matches!(&answer, Err(ClientError::Lost(why)) if why.to_string() == expected.to_string())
-        );
-        assert!(client.state.lock().unwrap().open.is_none());
     }
 
     #[test]

@@ -35,9 +35,7 @@ impl Attempt {
         }
         let pause = match failure {
             Failure::Exception(5 | 6) if tolerance.retry_busy => tolerance.pause.max(BUSY_PAUSE),
-            Failure::Exception(_) | Failure::Closed(Closed::BySelf | Closed::NoTransactionId) => {
-                return None;
-            }
+            Failure::Exception(_) | Failure::Closed(Closed::BySelf) => return None,
             Failure::Timeout
             | Failure::Incomplete
             | Failure::NoSilence

@@ -8,7 +8,7 @@ use core::time::Duration;
 use super::flights::{Call, Done, Flights, Strays, Ticket};
 use super::late_replies_without_ids::LateReplies;
 use super::mbap_datagrams::Datagrams;
-use super::mbap_stream::Stream;
+use super::mbap_stream::{MAX_IN_FLIGHT, Stream};
 use super::raised_timeouts::Lateness;
 use super::rtu_and_ascii::{Framing, OneAtATime};
 use super::{Attempt, Closed, MAX_READ_DELAY, Time, Tolerance, Transport};
@@ -165,10 +165,10 @@ impl Connection {
     /// longer, up to four times; end the request with [`Connection::cancel`] if it must not be.
     ///
     /// # Errors
-    /// [`Closed`]: the reason why the connection has ended, or [`Closed::NoTransactionId`].
+    /// [`Closed`]: the reason why the connection has ended.
     ///
     /// # Panics
-    /// If another request is in flight on a transport that carries one at a time: see
+    /// If another request is in flight on a transport that carries one at a time, or too many are: see
     /// [`Connection::has_room`].
     pub fn send(
         &mut self,
@@ -198,7 +198,7 @@ impl Connection {
         if let Some(why) = self.flights.closed {
             return Err(why);
         }
-        assert!(self.has_room(), "one request at a time");
+        assert!(self.has_room(), "too many requests are in flight");
         self.end_pause(now);
         self.sent += 1;
         let start = now.max(self.ready_at);
@@ -206,9 +206,7 @@ impl Connection {
         let request = adapted.as_ref().unwrap_or(request);
         let (flights, call) = (&mut self.flights, Call { unit_id, request, timeout, attempt });
         let ticket = match &mut self.wire {
-            Wire::Stream(stream) => {
-                stream.send(flights, call, start).ok_or(Closed::NoTransactionId)?
-            }
+            Wire::Stream(stream) => stream.send(flights, call, start),
             Wire::Datagrams(datagrams) => datagrams.send(flights, call, start),
             Wire::OneAtATime(line) => return Ok(line.send(flights, call, start, now)),
         };
@@ -219,7 +217,9 @@ impl Connection {
     /// Whether another request can be sent now.
     pub fn has_room(&self) -> bool {
         let many = matches!(self.wire, Wire::Stream(_));
-        self.flights.len() == 0 || (many && !self.flights.tolerance.is_one_at_a_time())
+        let most =
+            if many && !self.flights.tolerance.is_one_at_a_time() { MAX_IN_FLIGHT } else { 1 };
+        self.flights.len() < most
     }
 
     /// The number of requests in flight.

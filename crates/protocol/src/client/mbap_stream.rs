@@ -1,7 +1,7 @@
 //! MBAP frames in a stream: many requests in flight, matched by transaction id (Messaging on TCP/IP
 //! Implementation Guide V1.0b, 4.4.2).
 
-use alloc::collections::BTreeMap;
+use alloc::collections::{BTreeMap, VecDeque};
 use alloc::vec::Vec;
 use core::time::Duration;
 
@@ -14,15 +14,13 @@ use crate::frame::mbap::{self, Next};
 /// Bytes of an exception reply.
 const EXCEPTION_LEN: usize = mbap::HEADER_LEN + 2;
 
-/// The number of transaction ids.
-const TRANSACTION_IDS: usize = 65_536;
+/// The most requests in flight: half of the transaction ids, so that there is always a free one.
+pub(super) const MAX_IN_FLIGHT: usize = 32_768;
 
 #[derive(Debug, Default)]
 pub(super) struct Stream {
     next_id: u16,
-    /// Transaction ids of requests that were given up: their replies may still come. Those of an earlier
-    /// connection are only known by their ids.
-    given_up: BTreeMap<u16, Option<GivenUp>>,
+    given_up: AllGivenUp,
     pub(super) lateness: Lateness,
     /// The beginning of a frame.
     partial: Vec<u8>,
@@ -49,7 +47,40 @@ impl GivenUp {
     }
 }
 
-/// The latest transaction ids whose replies may still come, also on the next connection.
+/// The requests that were given up last: their replies may still come, and their transaction ids are not used
+/// again.
+#[derive(Debug, Default)]
+struct AllGivenUp {
+    /// Those of an earlier connection are only known by their ids.
+    by_id: BTreeMap<u16, Option<GivenUp>>,
+    /// In the order in which they were given up. A request may be given up long after those sent behind it: by
+    /// the order of ids, it would be forgotten at once, and its id be the next one.
+    ids: VecDeque<u16>,
+}
+
+impl AllGivenUp {
+    fn contains(&self, id: u16) -> bool {
+        self.by_id.contains_key(&id)
+    }
+
+    fn insert(&mut self, id: u16, request: Option<GivenUp>) {
+        if self.ids.len() >= usize::from(MAX_REMEMBERED_IDS)
+            && let Some(oldest) = self.ids.pop_front()
+        {
+            self.by_id.remove(&oldest);
+        }
+        self.ids.push_back(id);
+        self.by_id.insert(id, request);
+    }
+
+    fn remove(&mut self, id: u16) -> Option<Option<GivenUp>> {
+        let request = self.by_id.remove(&id)?;
+        self.ids.retain(|other| *other != id);
+        Some(request)
+    }
+}
+
+/// The latest transaction ids whose replies may still come, on a connection and from it to the next one.
 const MAX_REMEMBERED_IDS: u16 = 4096;
 
 impl Stream {
@@ -59,7 +90,7 @@ impl Stream {
 
     /// What the next connection needs: its first transaction id, and those that may still be answered.
     pub(super) fn take_ids(&mut self, flights: &Flights) -> (u16, Vec<u16>) {
-        let given_up = core::mem::take(&mut self.given_up).into_keys();
+        let given_up = core::mem::take(&mut self.given_up).ids.into_iter();
         let mut ids: Vec<u16> = given_up.chain(flights.unanswered.iter().copied()).collect();
         ids.retain(|id| self.is_recent(*id));
         (self.next_id, ids)
@@ -73,20 +104,12 @@ impl Stream {
     /// Goes on where another connection ended.
     pub(super) fn go_on(&mut self, next_id: u16, given_up: &[u16]) {
         self.next_id = next_id;
-        self.given_up = given_up.iter().map(|id| (*id, None)).collect();
+        given_up.iter().for_each(|id| self.given_up.insert(*id, None));
     }
 
-    pub(super) fn send(
-        &mut self,
-        flights: &mut Flights,
-        call: Call<'_>,
-        now: Time,
-    ) -> Option<Ticket> {
-        if flights.len() + self.given_up.len() >= TRANSACTION_IDS {
-            return None;
-        }
+    pub(super) fn send(&mut self, flights: &mut Flights, call: Call<'_>, now: Time) -> Ticket {
         let mut id = self.next_id;
-        while self.given_up.contains_key(&id) || flights.position(id).is_some() {
+        while self.given_up.contains(id) || flights.position(id).is_some() {
             id = id.wrapping_add(1);
         }
         self.next_id = id.wrapping_add(1);
@@ -95,7 +118,7 @@ impl Stream {
         flights.out.extend_from_slice(pdu);
         let ticket = flights.push(call, id, now);
         flights.raise_last(self.lateness.timeout(call.unit_id, call.timeout));
-        Some(ticket)
+        ticket
     }
 
     /// Gives a request up: its reply, should it come, is dropped. It still counts as a timeout at its
@@ -180,7 +203,7 @@ impl Stream {
             && let Some((id, _)) = bytes.split_first_chunk::<2>()
         {
             let id = u16::from_be_bytes(*id);
-            if flights.position(id).is_some() || self.given_up.contains_key(&id) {
+            if flights.position(id).is_some() || self.given_up.contains(id) {
                 break;
             }
             self.surplus -= 1;
@@ -197,7 +220,7 @@ impl Stream {
         sink: &mut impl FnMut(Done<'_>),
     ) -> Option<InvalidResponse> {
         let Some(position) = flights.position(id) else {
-            let Some(request) = self.given_up.remove(&id) else {
+            let Some(request) = self.given_up.remove(id) else {
                 return Some(InvalidResponse::TransactionId(id));
             };
             self.late(flights, request, now);
@@ -224,7 +247,8 @@ impl Stream {
         flights.came_late(took);
         flights.restart_after(ticket, now);
         // A device that handles one request at a time can't have begun those after it before.
-        let after = self.given_up.values_mut().flatten().filter(|other| other.ticket > ticket);
+        let all = self.given_up.by_id.values_mut().flatten();
+        let after = all.filter(|other| other.ticket > ticket);
         after.for_each(|other| other.began = other.began.map(|_| now));
         // A call that its caller has ended before its timeout says nothing of the unit.
         if took > within {
@@ -281,7 +305,7 @@ impl Stream {
     /// next reply would be taken for it.
     fn has_broken_off(&self, flights: &Flights) -> bool {
         match self.partial.first_chunk::<2>() {
-            Some(id) => self.given_up.contains_key(&u16::from_be_bytes(*id)),
+            Some(id) => self.given_up.contains(u16::from_be_bytes(*id)),
             None => !self.partial.is_empty() && flights.len() == 0,
         }
     }

@@ -15,7 +15,8 @@
 //!   tells it apart, a stream ends, and nothing is sent whose reply could be taken for it until it has
 //!   come or late replies are known to have ended. The next connection gets this as [`Past`].
 //! * Transaction ids go on from one connection to the next, and none is used again while a reply to it may
-//!   come.
+//!   come. The 4096 requests that were given up last are remembered: a late reply to an earlier one ends the
+//!   connection.
 //! * A reply that is read long after its timeout is late too, however early it came ([`MAX_READ_DELAY`]): the
 //!   process may have been stopped.
 //! * What no request asked for is counted apart from late replies ([`Strays`]). Datagrams that match no
@@ -203,9 +204,6 @@ pub enum Closed {
     /// A request timed out, and its late reply could be taken for the next one.
     #[error("a request timed out, and its reply may still arrive")]
     TimedOut,
-    /// All transaction ids are in use.
-    #[error("no transaction id is free")]
-    NoTransactionId,
 }
 
 impl Closed {
