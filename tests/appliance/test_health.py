@@ -203,7 +203,7 @@ def test_probes_are_told_of_a_stop_that_waits(run: Run, monkeypatch: pytest.Monk
     until_ready(appliance)
     address = endpoint(appliance, "metrics")
     waits = threading.Event()
-    monkeypatch.setattr(appliance._parts().leases, "close", waits.wait)
+    monkeypatch.setattr(appliance._require_running().leases, "close", waits.wait)
     stopping = threading.Thread(target=appliance.stop)
     with closing(web.Client(address)) as client:
         stopping.start()
@@ -254,7 +254,7 @@ def test_the_watchdog_has_the_judgement_of_the_probe(
     run: Run, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     appliance = run(PLANT)
-    running = appliance._parts()
+    running = appliance._require_running()
     wire.until(lambda: probe(appliance, "live")[0] == 200, "it is served")
     assert appliance.is_live
     monkeypatch.setattr(

@@ -78,7 +78,7 @@ def contents(appliance: Appliance) -> list[int]:
 
 
 def audit_of(appliance: Appliance) -> Audit:
-    audit = appliance._parts().audit.log
+    audit = appliance._require_running().audit.log
     assert audit is not None
     return audit
 

@@ -167,7 +167,7 @@ def test_datagrams_and_packets_are_audited(run: Run, tmp_path: Path) -> None:
 
 def test_what_a_service_writes_is_audited_before_it_is_answered(run: Run, tmp_path: Path) -> None:
     appliance = run(CONFIGURATION)
-    audit = appliance._parts().audit.log
+    audit = appliance._require_running().audit.log
     assert audit is not None
     memory_access = MemoryAccess("rest", appliance.memories, audit)
     grant = Grant("gateway", ("plant",), ("coils",))

@@ -772,7 +772,7 @@ def test_a_full_disk_keeps_closed_audit_logs_from_passing_writes_on(
 
 def write_as_mqtt(appliance: Appliance, command: dict[str, object]) -> None:
     """Writes as MQTT does: unlike REST, it waits for the device in its own thread."""
-    parts = appliance._parts()
+    parts = appliance._require_running()
     access = MemoryAccess("mqtt", appliance.memories, parts.audit.log, parts.devices.passages)
     grant = Grant("edge", ["mirror"], ["holding_registers"])
     access.ingest(json.dumps(command).encode(), grant, "127.0.0.1:9")

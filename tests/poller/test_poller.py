@@ -1014,7 +1014,7 @@ def test_a_device_that_is_disabled_is_told_so_and_left_alone(run: Run) -> None:
 def test_an_appliance_without_enabled_devices_polls_nothing(run: Run) -> None:
     meter = device("tcp://127.0.0.1:1", read("coils", 0, 8, ("coils", 0)), enabled=False)
     appliance = run(configuration({"meter": meter}))
-    assert appliance._parts().devices.poller is None
+    assert appliance._require_running().devices.poller is None
     assert appliance.diagnostics.stats()["devices"] == {"meter": {"health": "disabled"}}
 
 
@@ -1143,7 +1143,7 @@ def test_a_missing_plan_and_refused_results_are_logged(run: Run, records: web.Re
     reads = [read("coils", 0, 8, ("coils", 0))]
     with Fake(data) as fake:
         appliance = run(configuration({"meter": device(fake.url, *reads)}))
-        devices: Any = appliance._parts().devices
+        devices: Any = appliance._require_running().devices
         devices.poller = altered = Altered(devices.poller)
         until_polled(appliance, "meter", 1)
         told = counters(appliance, "meter")
@@ -1186,7 +1186,7 @@ def test_refused_results_are_not_logged_again_after_a_reload(
             return load(file)
 
         with Appliance(loaded()) as appliance:
-            devices: Any = appliance._parts().devices
+            devices: Any = appliance._require_running().devices
             devices.poller = altered = Altered(devices.poller)
 
             def refused(count: int) -> None:
