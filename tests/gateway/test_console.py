@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import re
@@ -17,6 +18,7 @@ from support.fake_device import HANG_UP, FakeDevice, exception, registers
 from support.gateway_pages import DESK, PHONE, Opened, Pages, View, floats, opening
 from support.gateways import Dialed, Names
 from support.secured import Authority, Relay, context
+from support.tcp_proxy import Proxy
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -839,6 +841,25 @@ def test_a_write_without_a_reply_is_told_as_unknown_and_read_back(
         expect(view.row(1).get_by_role("cell").first).to_have_text(
             "4711" if carried_out else "1234"
         )
+
+
+def test_a_write_that_the_browser_sends_again_is_carried_out_once(opened: Opened) -> None:
+    def lost(pdu: bytes) -> None:
+        device.values[1] = int.from_bytes(pdu[3:5])
+        proxy.cut()
+
+    device = Registers(lost)
+    with FakeDevice(device) as plc:
+        view = opened()
+        with contextlib.closing(Proxy(view.gateway.address[1], "http")) as proxy:
+            view.gateway.url = proxy.url
+            view.requests.clear()
+            read_registers(view.open(), plc.port)
+            alert = write_4711(view).get_by_role("alert")
+            expect(alert).to_contain_text("Unknown whether it was written.")
+            expect(alert).to_contain_text("The browser or a proxy sent the write again.")
+            expect(alert).to_contain_text("Read back: the new values are there.")
+            assert len(device.writes) == 1
 
 
 def test_a_write_that_can_not_be_read_back_says_so(opened: Opened) -> None:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import socket
 import struct
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
+from unittest.mock import ANY
 
 import pytest
 
 import holdfast
-from holdfast.gateway import pool
+from holdfast.gateway import pool, repeated_writes
 from holdfast.gateway.pool import Pool
 from support import gateways, transports, web, wire
 from support.fake_device import HANG_UP, FakeDevice, Stream, exception, registers
@@ -399,6 +401,97 @@ def test_a_write_is_never_repeated(client: web.Client) -> None:
         assert [pdu[0] for pdu in device.asked] == [3, 6]
 
 
+def write_with_key(client: web.Client, port: int, key: str, **more: Any) -> web.Answer:
+    where = {"host": "127.0.0.1", "port": port, "address": 0, "value": 1, **more}
+    path = f"{gateways.API}/write/register"
+    return client.ask("POST", path, where, {**web.JSON, "Idempotency-Key": key})
+
+
+def test_a_write_that_is_sent_again_is_carried_out_once(client: web.Client) -> None:
+    prefix = client.get("/api/gateway").json["keyPrefix"]
+    with FakeDevice(lambda pdu: pdu) as device:
+        for key in ("1f0a", '"1f0b"', f"{prefix}1"):
+            first = write_with_key(client, device.port, key)
+            assert first.status == 200
+            assert write_with_key(client, device.port, key).body == first.body
+        assert len(device.asked) == 3
+        for key, more, says in (
+            ("1f0a", {"value": 2}, "Idempotency-Key was used for another request"),
+            ("", {}, 'Idempotency-Key is "", allowed: 1 to 128 visible ASCII characters'),
+            ("1" * 129, {}, "allowed: 1 to 128 visible ASCII characters"),
+        ):
+            answer = write_with_key(client, device.port, key, **more)
+            assert (answer.status, answer.headers["holdfast-reason"]) == (400, "malformed")
+            assert says in answer.json["error"]
+        of_another_start = write_with_key(client, device.port, "00000000/1")
+        assert of_another_start.status == 409
+        assert of_another_start.headers["holdfast-reason"] == "repeated"
+        assert of_another_start.headers["holdfast-maybe-written"] == "true"
+        assert len(device.asked) == 3
+
+
+def test_the_last_keys_are_remembered(client: web.Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(repeated_writes, "MAX_ENDED", 2)
+    with FakeDevice(lambda pdu: pdu) as device:
+        for key in ("1", "2", "3", "3", "2", "1"):
+            assert write_with_key(client, device.port, key).status == 200
+        assert len(device.asked) == 4
+
+
+@pytest.mark.parametrize("then", ["is answered", "is alone", "ends"])
+def test_a_write_that_is_sent_again_has_the_outcome_of_the_first(
+    gateway: Running, then: str
+) -> None:
+    """That its client is gone, or that the gateway ends, leaves what was sent unknown."""
+    asked, go_on = threading.Semaphore(0), threading.Event()
+
+    def answer(pdu: bytes) -> bytes | None:
+        asked.release()
+        assert go_on.wait(wire.DEADLINE)
+        return pdu if then == "is answered" else None
+
+    with FakeDevice(answer) as device, ThreadPoolExecutor(1) as threads:
+        first = wire.Connection(gateway.address)
+        body = {"host": "127.0.0.1", "port": device.port, "address": 0, "value": 1}
+        text = json.dumps({**body, "timeout": 60_000}).encode()
+        length = f"Content-Length: {len(text)}"
+        path = f"{gateways.API}/write/register"
+        first.send(web.head("POST", path, "Idempotency-Key: 1", length) + text)
+        assert asked.acquire(timeout=wire.DEADLINE)
+        requests = gateway.gateway.status()["requests"]
+        again = threads.submit(write_with_key, gateway.client(), device.port, "1", timeout=60_000)
+        wire.until(lambda: gateway.gateway.status()["requests"] > requests, "it has come")
+        if then == "is alone":
+            first.reset()
+        elif then == "ends":
+            gateway.stop.set()
+        go_on.set()
+        found = again.result(wire.DEADLINE)
+        first.close()
+        assert len(device.asked) == 1
+    status, reason = {
+        "is answered": (200, None),
+        "is alone": (409, "repeated"),
+        "ends": (503, "stopping"),
+    }[then]
+    assert (found.status, found.headers.get("holdfast-reason")) == (status, reason)
+    assert found.headers.get("holdfast-maybe-written") == (None if reason is None else "true")
+
+
+def test_a_write_that_was_not_sent_is_carried_out_when_it_is_sent_again(gateway: Running) -> None:
+    with socket.socket() as plc, ThreadPoolExecutor(1) as threads:
+        plc.settimeout(wire.DEADLINE)
+        plc.bind(("127.0.0.1", 0))
+        _, port = plc.getsockname()
+        answer = write_with_key(gateway.client(), port, "1")
+        assert answer.headers["holdfast-reason"] == "no_connection"
+        plc.listen()
+        again = threads.submit(write_with_key, gateway.client(), port, "1")
+        with plc.accept()[0] as connection:
+            connection.sendall(connection.recv(64))
+            assert again.result(wire.DEADLINE).status == 200
+
+
 def test_after_a_timeout_the_next_request_has_a_new_connection(client: web.Client) -> None:
     replies = iter([b"", b"x"])
     with FakeDevice(lambda pdu: registers(pdu, 5) if next(replies) else None) as device:
@@ -705,6 +798,7 @@ def test_a_gateway_says_what_it_may_do(client: web.Client) -> None:
         "allow": ["10.0.0.0/8", "192.168.1.0/24:5020", "127.0.0.0/8:*"],
         "limits": {"timeout": 60000, "interval": 100},
         "connections": 0,
+        "keyPrefix": ANY,
     }
 
 

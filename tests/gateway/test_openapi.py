@@ -166,11 +166,11 @@ def test_every_request_of_a_device_may_have_tls() -> None:
         if not path.startswith(gateways.API):
             continue
         [operation] = methods.values()
-        if "parameters" in operation:
-            fields = {each["name"]: each["schema"] for each in operation["parameters"]}
-        else:
+        if "requestBody" in operation:
             content = operation["requestBody"]["content"]
             fields = content["application/json"]["schema"]["properties"]
+        else:
+            fields = {each["name"]: each["schema"] for each in operation["parameters"]}
         assert "tls" in fields["transport"]["enum"], path
         assert fields["serverName"]["type"] == "string", path
 

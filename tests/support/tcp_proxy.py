@@ -1,4 +1,4 @@
-"""A proxy in front of a broker, which disturbs its connections."""
+"""A proxy in front of a server, which disturbs its connections."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from support import wire
 
 
 class Proxy:
-    """Passes connections on to a port. It can cut them while the broker keeps running."""
+    """Passes connections on to a port. It can cut them while the server keeps running."""
 
     def __init__(self, port: int, scheme: str = "mqtt") -> None:
         self._to = port

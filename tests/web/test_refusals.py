@@ -96,7 +96,7 @@ def test_the_document_of_rest_has_what_a_route_refuses(
     ("path", "expected"),
     [
         ("/api/modbus/read", {400, 403, 405, 408, 413, 415, 500, 503}),
-        ("/api/modbus/write/coil", {400, 403, 405, 408, 413, 415, 500, 503}),
+        ("/api/modbus/write/coil", {400, 403, 405, 408, 409, 413, 415, 500, 503}),
         ("/api/modbus/map", {400, 403, 405, 408, 413, 415, 500, 503}),
         ("/api/modbus/watch", {400, 403, 405, 500, 503}),
         ("/api/gateway", {403, 405}),

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 import logging
 from collections import Counter
+from functools import partial
 from math import inf
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -24,6 +25,7 @@ from holdfast.gateway.endpoints import address_map
 from holdfast.gateway.endpoints.request_tags import SHORT_SIZE
 from holdfast.gateway.pool import Pool
 from holdfast.gateway.refusals import EXCEPTION_STATUS, FAILURE, REFUSALS
+from holdfast.gateway.repeated_writes import RepeatedWrites
 from holdfast.gateway.shared_devices import Shared
 from holdfast.gateway.streams import views, watch
 from holdfast.gateway.write_outcome import outcome
@@ -108,6 +110,7 @@ class App(Application):
             dial=dial,
             shared=None if poller is None else Shared(poller),
         )
+        self._repeated = RepeatedWrites()
         self._active: Counter[object] = Counter()
         """The number of pending `requests` and `streams`, of requests by host and port of the
         device, and of streams by address of the client."""
@@ -256,7 +259,8 @@ class App(Application):
                 raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
             device = RequestedDevice(self._routes, self._pool, given, broadcast=endpoint.broadcast)
             with self._request_to(device):
-                work = self._reply(request, endpoint, given, device, is_write)
+                reply = partial(self._reply, request, endpoint, given, device, is_write)
+                work = self._repeated.carry_out(request, device, reply) if is_write else reply()
                 try:
                     return await self._until_disconnect(request, work, grace=self._limits.ending)
                 except ClientDisconnected:
@@ -440,6 +444,7 @@ class App(Application):
                     "interval": round(1000 * limits.interval),
                 },
                 "connections": len(self._pool),
+                "keyPrefix": self._repeated.prefix,
             }
         )
 

@@ -18,7 +18,8 @@ from holdfast.gateway.endpoints import (
     write,
 )
 from holdfast.gateway.fields import timeout
-from holdfast.gateway.refusals import DEVICE, FAILURE, REFUSALS
+from holdfast.gateway.refusals import DEVICE, FAILURE, REFUSALS, WRITE
+from holdfast.gateway.repeated_writes import KEY
 from holdfast.gateway.schemas import SCHEMAS
 from holdfast.gateway.schemas import TARGET as TARGET_SCHEMAS
 from holdfast.gateway.streams import views, watch
@@ -75,8 +76,9 @@ def _of_device(endpoint: Endpoint, settings: Settings) -> Operation[App]:
         endpoint.summary,
         lambda app, request, given: app.carry_out(request, endpoint, given),
         json_answer("The device responded", {"oneOf": [whole, ref("ModbusException")]}, example),
-        DEVICE if endpoint.writes is never else (*DEVICE, "writes_off"),
+        DEVICE if endpoint.writes is never else (*DEVICE, *WRITE),
         endpoint.description,
+        headers=() if endpoint.writes is never else (KEY,),
         body=body(fields, endpoint.examples),
         failures=(FAILURE,),
     )
@@ -152,6 +154,7 @@ _STATUS: Operation[App] = Operation(
             "allow": ["10.0.0.0/8:502"],
             "limits": {"timeout": 60000, "interval": 100},
             "connections": 2,
+            "keyPrefix": "5f0c9a3e/",
         },
     ),
 )

@@ -24,6 +24,13 @@ REFUSALS = Refusals(
     ),
     Refusal(404, ("not_found",), "The resource does not exist", 'no resource at "/api"'),
     Refusal(
+        409,
+        ("repeated",),
+        "The write was sent before, by its `Idempotency-Key`, and its outcome is unknown",
+        "Idempotency-Key is known, but not what the device has replied: the write may have been "
+        "carried out before",
+    ),
+    Refusal(
         415,
         ("not_json",),
         "The body is not `application/json` or `application/x-www-form-urlencoded`, or is "
@@ -56,3 +63,6 @@ FAILURE = Refusal(
 
 DEVICE = ("refused_target", "busy", "stopping")
 """Reasons of all operations on devices, beside those of `FAILURE`."""
+
+WRITE = ("writes_off", "repeated")
+"""Further reasons of operations that may write."""

@@ -63,6 +63,10 @@ _STATUS = object_of(
         "allow": array_of(TEXT),
         "limits": object_of({"timeout": COUNT, "interval": COUNT}),
         "connections": count("Open connections to devices"),
+        "keyPrefix": TEXT
+        | {
+            "description": "An `Idempotency-Key` with it is refused after the gateway has restarted"
+        },
     }
 )
 _TYPED_CHANGE = object_of(

@@ -26,12 +26,22 @@ export const forgetToken = () => sessionStorage.removeItem(KEY);
 export const get = async (path) => answer(await send(path));
 
 /** Sends a POST request and returns the answer; `body` is an object, or JSON text without a timeout. */
-export const post = async (path, body, signal) => answer(await sendJson(path, body, { signal, extraTime: body.timeout }));
+export const post = async (path, body, { signal, headers } = {}) =>
+  answer(await sendJson(path, body, { signal, headers, extraTime: body.timeout }));
+
+/**
+ * Returns the header of one write. With it, the gateway writes once, also when the browser sends the request again by
+ * itself: it does so when the connection that it has reused ends without a response.
+ */
+export async function keyHeader() {
+  const { keyPrefix } = await get("/api/gateway");
+  return { "Idempotency-Key": keyPrefix + crypto.getRandomValues(new Uint32Array(4)).join("-") };
+}
 
 /** Sends a POST request; `body` is an object or JSON text. For the options, see `send`. */
-export function sendJson(path, body, options) {
+export function sendJson(path, body, { headers, ...options }) {
   const text = typeof body === "string" ? body : JSON.stringify(body);
-  return send(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: text, ...options });
+  return send(path, { method: "POST", headers: { "Content-Type": "application/json", ...headers }, body: text, ...options });
 }
 
 /** Sends a request, and waits for `extraTime` beyond the usual time for the answer to begin. */
@@ -166,6 +176,7 @@ const WORDS = {
   writes_off: ["Writes are disabled.", ["Enable them with --access read-write, or with access: read-write in the gateway's configuration."]],
   unauthorized: ["This gateway requires a token.", ["Create one with `holdfast token --line` for the token file, or with `holdfast token --gateway` for the configuration."]],
   busy: ["The gateway is busy.", ["Try again in a moment."]],
+  repeated: ["The browser or a proxy sent the write again. The gateway did not write again.", ["Did a proxy or the gateway restart?"]],
   stopping: ["The gateway is stopping.", ["Reload the page when it runs again."]],
   gateway_gone: ["The gateway does not answer.", ["Is it still running?", "Reload the page when it runs again."]],
 };

@@ -80,7 +80,7 @@ export class Lists {
     const source = profile ? { profile } : { tags: text, format: formatOf(this.name, text) };
     $("tags-error").textContent = "";
     try {
-      const { tags } = await post("/api/gateway/tags", source, signal);
+      const { tags } = await post("/api/gateway/tags", source, { signal });
       if (signal.aborted) return;
       this.add(list(profile || this.name || `${tags.length} ${tags.length === 1 ? "tag" : "tags"}`, source));
       this.dialog.close();

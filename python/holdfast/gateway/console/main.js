@@ -91,7 +91,7 @@ async function connect() {
   try {
     await loadGatewaySettings();
     const began = performance.now();
-    const found = await post("/api/modbus/connect", asked, aborting.signal);
+    const found = await post("/api/modbus/connect", asked, { signal: aborting.signal });
     if (connecting !== aborting) return;
     const took = Math.round(performance.now() - began);
     if (found.exception) selectDevice(asked, `The device responded in ${took} ms, but can't read holding register 0: ${found.exception}. Other areas may work.`);

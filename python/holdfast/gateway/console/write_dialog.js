@@ -1,6 +1,6 @@
 // The write dialog: asks for a value, reviews what it changes, then writes it.
 
-import { notice, post, Problem } from "./api.js";
+import { keyHeader, notice, post, Problem } from "./api.js";
 import { isPlain, ofTag, ofType, ofWords } from "./write_request.js";
 import { $, h, pause } from "./dom.js";
 import { extent, modicon, REGISTER_FORMS } from "./numbers.js";
@@ -247,6 +247,7 @@ export class Writer {
   async confirm(asked) {
     const { change, before } = asked;
     this.tell(READING);
+    const headers = await keyHeader();
     // A tag that can't be read may have another definition too.
     if (change.tag) await ofTag(asked, $("write-value").value);
     // Who has looked again may write, even if a value changes all the time.
@@ -258,17 +259,17 @@ export class Writer {
       return CHANGED;
     }
     this.tell("Writing…");
-    asked.sending = this.write(asked, change);
+    asked.sending = this.write(asked, change, headers);
     await asked.sending;
     return "";
   }
 
   /** Writes the confirmed values. Never throws: `asked.outcome` has the outcome. */
-  async write(asked, change) {
+  async write(asked, change, headers) {
     const doubt = asked.outcome === "unknown" ? "unknown" : "refused";
     asked.outcome = "unknown";
     try {
-      await post(...change.request());
+      await post(...change.request(), { headers });
       asked.outcome = "written";
       if (this.isAbout(asked)) this.dialog.close();
     } catch (error) {

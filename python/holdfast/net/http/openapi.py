@@ -86,8 +86,12 @@ def _operation(api: Api, operation: Operation[Any], *, secured: bool) -> dict[st
     made["security"] = [{"token": []}] if secured and not operation.is_public else []
     if operation.body is not None:
         made["requestBody"] = _body(operation.body)
-    if operation.parameters:
-        made["parameters"] = [_parameter(each) for each in operation.parameters]
+    parameters = [
+        *(_parameter(each, "query") for each in operation.parameters),
+        *(_parameter(each, "header") for each in operation.headers),
+    ]
+    if parameters:
+        made["parameters"] = parameters
     rows = _rows(api, operation, secured=secured)
     refused = {str(row.status): ref(_component(row), "responses") for row in rows}
     return made | {"responses": {"200": operation.answer, **refused}}
@@ -102,10 +106,10 @@ def _body(body: Body) -> dict[str, Any]:
     return {"required": True, "content": content}
 
 
-def _parameter(field: Field) -> dict[str, Any]:
+def _parameter(field: Field, place: str) -> dict[str, Any]:
     return {
         "name": field.name,
-        "in": "query",
+        "in": place,
         "required": field.required,
         "description": field.text,
         "schema": field.typed,

@@ -77,6 +77,8 @@ class Operation(Generic[App]):
     """The reasons of refusals that not all operations have."""
     description: str = ""
     parameters: Sequence[Field] = ()
+    headers: Sequence[Field] = ()
+    """Headers that the handler checks."""
     body: Body | None = None
     check: Callable[[App, Request], None] | None = None
     """Raises `BadRequest` for a client without the right to the operation, before its body is
