@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import json
 import re
+import threading
 from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
@@ -13,7 +14,7 @@ from playwright.sync_api import expect
 
 from holdfast.client.url import Tls
 from holdfast.tags import Tag, TagList
-from support import gateway_pages
+from support import gateway_pages, wire
 from support.fake_device import HANG_UP, FakeDevice, exception, registers
 from support.gateway_pages import DESK, PHONE, Opened, Pages, View, floats, opening
 from support.gateways import Dialed, Names
@@ -948,6 +949,57 @@ def test_values_read_back_do_not_replace_newer_ones_of_a_watch(opened: Opened, t
         there_still = f": 1 of 127.0.0.1:{there.port}."
         view.says("Written" + (there_still if then == "is stopped" else ". The watch continues."))
         expect(cell).to_have_text("2222")
+
+
+def test_a_read_that_a_write_has_overtaken_is_read_again(opened: Opened) -> None:
+    held: list[tuple[Route, Any]] = []
+
+    def hold(route: Route) -> None:
+        if held:
+            route.continue_()
+        else:
+            held.append((route, route.fetch()))
+
+    with FakeDevice(Registers()) as device:
+        view = opened()
+        read_registers(view, device.port)
+        view.page.route("**/api/modbus/watch/view", hold)
+        with view.page.expect_request("**/api/modbus/watch/view"):
+            view.button("Read").click()
+        write_4711(view)
+        view.says("Holding registers 0 to 9: read in")
+        view.says(f"Written: 1 of 127.0.0.1:{device.port}.")
+        route, old = held[0]
+        route.fulfill(response=old)
+        expect(view.row(1).get_by_role("cell").first).to_have_text("4711")
+
+
+def test_a_table_that_was_read_during_a_write_is_read_again(opened: Opened) -> None:
+    def slow(pdu: bytes) -> bytes:
+        device.values[1] = 4711
+        assert go_on.wait(wire.DEADLINE)
+        return pdu
+
+    go_on = threading.Event()
+    device = Registers(slow)
+    with FakeDevice(device) as plc:
+        view = opened()
+        read_registers(view, plc.port)
+        old = {"kind": "range", "functionCode": 3, "address": 1, "quantity": 1}
+        part = {**old, "format": "registers", "values": [1234], "texts": [], "errors": {}}
+        data = json.dumps({"time": 0, "rtt": 0, "stream": False, "parts": [part]})
+        event = {"content_type": "text/event-stream", "body": f"event: view\ndata: {data}\n\n"}
+        view.page.route("**/watch/view", lambda route: route.fulfill(**event), times=1)
+        dialog = write_4711(view)
+        expect(dialog.get_by_text("Writing…")).to_be_visible()
+        view.page.keyboard.press("Escape")
+        view.choose(address="1", quantity="1")
+        view.button("Read").click()
+        view.says("Holding registers 1 to 1: read in")
+        expect(view.row(1).get_by_role("cell").first).to_have_text("1234")
+        go_on.set()
+        view.says(f"Written: 1 of 127.0.0.1:{plc.port}.")
+        expect(view.row(1).get_by_role("cell").first).to_have_text("4711")
 
 
 def test_errors_before_a_write_are_told_in_plain_words(opened: Opened) -> None:

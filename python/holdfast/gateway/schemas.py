@@ -39,7 +39,10 @@ _RANGES: Schema = {
     **array_of({**array_of(ADDRESS_SCHEMA), "minItems": 2, "maxItems": 2}),
     "description": "The first and the last address of each range",
 }
-_NOW: dict[str, Schema] = {"time": count("Milliseconds since 1970"), "rtt": COUNT}
+_NOW: dict[str, Schema] = {
+    "time": count("The end of the poll, in milliseconds since 1970"),
+    "rtt": count("The duration of the poll in milliseconds"),
+}
 CODE: Schema = {**integer(0, 255), "description": "The code of a Modbus exception"}
 _ASKED = {"functionCode": FUNCTION_SCHEMA, "address": ADDRESS_SCHEMA, "quantity": _QUANTITY}
 

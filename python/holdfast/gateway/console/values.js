@@ -232,13 +232,14 @@ export class Values {
 
   async read(wanted, more = null) {
     this.stop();
-    const reading = new AbortController();
+    const reading = { wanted, request: new AbortController() };
     this.reading = reading;
-    say($("outcome"), "Reading…");
+    this.turn += 1;
+    say($("outcome"), "Reading…", more);
     const note = wanted.length === 1 ? wanted[0].note ?? null : null;
     try {
       const began = performance.now();
-      const data = await this.once(wanted, reading.signal);
+      const data = await this.once(wanted, reading.request.signal);
       if (this.reading !== reading) return;
       const took = `read in ${Math.round(performance.now() - began)} ms.`;
       const [first] = data.parts;
@@ -251,7 +252,7 @@ export class Values {
     } catch (error) {
       if (this.reading !== reading) return;
       this.panels.forEach((panel) => panel.stale("The last read failed."));
-      say($("outcome"), notice(error), note);
+      say($("outcome"), notice(error), note, more);
     }
     this.reading = null;
   }
@@ -296,24 +297,27 @@ export class Values {
     const told = WRITTEN[outcome];
     const { device } = panel.part;
     const isShown = () => this.panels.includes(panel) && this.device === device;
-    const tell = () => say($("outcome"), this.watching && isShown() ? `${told}. The watch continues.`
-      : `${told}: ${cell} of ${parts.hostAndPort(device)}.`);
-    if (this.watching || !isShown()) return tell();
+    const where = `${told}: ${cell} of ${parts.hostAndPort(device)}.`;
+    const tell = () => say($("outcome"), this.watching && isShown() ? `${told}. The watch continues.` : where);
+    if (this.watching || this.device !== device) return tell();
+    // What is read already may be older than the write.
+    if (this.reading) return this.read(this.reading.wanted, where);
     const turn = (this.turn += 1);
-    // A watch or another reading back may have begun meanwhile. Its values are newer than these.
-    const isNewest = () => isShown() && this.turn === turn;
+    // A watch or another read may have begun meanwhile. Its values are newer than these.
+    const isNewest = () => this.device === device && this.turn === turn;
     try {
       const data = await this.once(this.wholes);
       if (!isNewest()) return tell();
       if (!this.fits(data)) this.show(this.wholes, data);
       this.take(data, true);
       const own = data.parts[this.wholes.indexOf(panel.whole)];
+      if (!own) return tell();
       if (own.error) throw new Problem(own.reason, own.error, own.code);
       const changed = `${told} and read back. Changes are marked.`;
       say($("outcome"), outcome === "written" ? changed : `${told}. The table shows the values read back.`);
     } catch (error) {
       if (!isNewest()) return tell();
-      panel.stale("Reading back failed.");
+      (this.panels.includes(panel) ? [panel] : this.panels).forEach((each) => each.stale("Reading back failed."));
       say($("outcome"), notice(error, `${told}. Reading back failed.`));
     }
   }
@@ -498,7 +502,7 @@ export class Values {
 
   /** Stops reading and watching. The last values stay visible. */
   stop() {
-    this.reading?.abort();
+    this.reading?.request.abort();
     this.reading = null;
     if (!this.watching) return;
     this.watching.abort();
