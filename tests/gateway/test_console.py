@@ -974,6 +974,19 @@ def test_a_read_that_a_write_has_overtaken_is_read_again(opened: Opened) -> None
         expect(view.row(1).get_by_role("cell").first).to_have_text("4711")
 
 
+@pytest.mark.parametrize("streams", [16, 0])
+def test_a_watch_reads_at_once_after_a_write(opened: Opened, streams: int) -> None:
+    with FakeDevice(Registers()) as device:
+        view = opened(limits={"interval": 0.05, "streams": streams})
+        read_registers(view, device.port)
+        view.choose(interval="3600000")
+        view.button("Watch").click()
+        view.says("Watching holding registers 0 to 9")
+        write_4711(view)
+        view.says("Written. The watch continues.")
+        expect(view.row(1).get_by_role("cell").first).to_have_text("4711")
+
+
 def test_a_table_that_was_read_during_a_write_is_read_again(opened: Opened) -> None:
     def slow(pdu: bytes) -> bytes:
         device.values[1] = 4711

@@ -44,7 +44,11 @@ export async function once(button, work) {
   }
 }
 
-export const pause = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
+/** Waits, or until `signal` is aborted. */
+export const pause = (milliseconds, signal) => new Promise((resolve) => {
+  setTimeout(resolve, milliseconds);
+  signal?.addEventListener("abort", resolve);
+});
 
 /**
  * Returns what tells the milliseconds since now, by the clock that tells more: the clock of the machine may be set back,

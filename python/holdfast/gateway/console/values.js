@@ -299,8 +299,12 @@ export class Values {
     const isShown = () => this.panels.includes(panel) && this.device === device;
     const where = `${told}: ${cell} of ${parts.hostAndPort(device)}.`;
     const tell = () => say($("outcome"), this.watching && isShown() ? `${told}. The watch continues.` : where);
-    if (this.watching || this.device !== device) return tell();
+    if (this.device !== device) return tell();
     // What is read already may be older than the write.
+    if (this.watching) {
+      this.watching.request.abort();
+      return tell();
+    }
     if (this.reading) return this.read(this.reading.wanted, where);
     const turn = (this.turn += 1);
     // A watch or another read may have begun meanwhile. Its values are newer than these.
@@ -333,11 +337,11 @@ export class Values {
     }
   }
 
-  /** Watches parts until it is stopped. Retries when the stream ends, and polls if there is none. */
+  /** Watches parts until it is stopped. Asks again when the request ends or is aborted, and polls without streams. */
   async watch(wanted, plotted = this.plotted) {
     this.stop();
-    const stopping = new AbortController();
-    this.watching = stopping;
+    const watch = { request: null };
+    this.watching = watch;
     this.turn += 1;
     const signature = JSON.stringify(wanted.map(parts.asked));
     this.plotted = [undefined, signature].includes(this.signature) ? plotted : [];
@@ -352,15 +356,17 @@ export class Values {
     this.remember();
     say($("outcome"), "Reading…");
     let told = null;
-    while (this.watching === stopping) {
+    while (this.watching === watch) {
+      watch.request = new AbortController();
+      const { signal } = watch.request;
       let streams = null; // Known from the `view` event, which says what the changes after it are of.
       // The profiles of the gateway may change at any time, other lists never do.
       const describe = !this.polls || wanted.some((part) => part.source?.profile);
       const more = { interval: this.interval, maxStreams: MAX_STREAMS.watch, describe };
       try {
         if (told !== null) await this.gateway.refresh();
-        await this.stream(wanted, more, stopping.signal, (name, data) => {
-          if (this.watching !== stopping) return;
+        await this.stream(wanted, more, signal, (name, data) => {
+          if (this.watching !== watch) return;
           if (name === "view") {
             streams = data.stream;
             this.opened(wanted, data);
@@ -369,14 +375,15 @@ export class Values {
           }
           told = null;
         });
-        if (this.watching !== stopping) return;
+        if (this.watching !== watch) return;
         if (streams === false) {
-          await pause(this.interval);
+          await pause(this.interval, signal);
           continue;
         }
         told = this.interrupted(null, told);
       } catch (error) {
-        if (this.watching !== stopping) return;
+        if (this.watching !== watch) return;
+        if (signal.aborted) continue;
         if (!this.began || FINAL.has(error.reason)) {
           this.stop();
           this.panels.forEach((panel) => panel.stale("The watch has ended."));
@@ -505,7 +512,7 @@ export class Values {
     this.reading?.request.abort();
     this.reading = null;
     if (!this.watching) return;
-    this.watching.abort();
+    this.watching.request.abort();
     this.watching = null;
     this.heard = null;
     this.plotted = this.plots?.keys() ?? this.plotted;
