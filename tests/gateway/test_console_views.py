@@ -915,6 +915,18 @@ def test_downloaded_plots_have_all_digits(opened: Opened, plant: holdfast.Memory
     assert {row["value"] for row in saved(found.value)} == {"9007199254740993", "9007199254740992"}
 
 
+def test_stopped_plots_are_downloaded_later(opened: Opened) -> None:
+    meter = Meter()
+    with FakeDevice(meter) as device:
+        view = watched(opened, device.port)
+        expect(view.page.get_by_role("article").get_by_text("…")).to_be_visible()
+        view.button("Stop").click()
+        view.page.evaluate("() => { const now = Date.now; Date.now = () => now() + 3_600_000; }")
+        with view.page.expect_download() as found:
+            view.button("Download plots as CSV").click()
+        assert len(saved(found.value)) > 1
+
+
 def test_coils_that_were_never_read_have_no_value_in_a_download(opened: Opened) -> None:
     view = connected(opened)
     view.choose(area="1", address="1000", quantity="2")

@@ -153,8 +153,10 @@ export class Plots {
     for (const plot of this.shown.values()) plot.draw();
   }
 
-  /** Stops updating. */
+  /** Stops updating. The plots stay as they are. */
   stop() {
+    const since = this.since();
+    this.since = () => since;
     this.draw();
     clearInterval(this.timer);
   }
