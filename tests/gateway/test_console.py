@@ -354,6 +354,10 @@ def test_a_plot_is_chosen_and_removed(opened: Opened) -> None:
     view.button("Remove the plot of 6").click()
     expect(view.button("Remove the plot of 6")).to_be_hidden()
     expect(view.button("Remove the plot of 4")).to_be_visible()
+    view.button("Stop").click()
+    view.read_four(100)
+    view.button("Plot 102").click()
+    expect(view.button("Remove the plot of 102")).to_be_visible()
 
 
 @both

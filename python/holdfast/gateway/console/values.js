@@ -338,13 +338,13 @@ export class Values {
   }
 
   /** Watches parts until it is stopped. Asks again when the request ends or is aborted, and polls without streams. */
-  async watch(wanted, plotted = this.plotted) {
+  async watch(wanted, plotted = null) {
     this.stop();
     const watch = { request: null };
     this.watching = watch;
     this.turn += 1;
     const signature = JSON.stringify(wanted.map(parts.asked));
-    this.plotted = [undefined, signature].includes(this.signature) ? plotted : [];
+    this.plotted = plotted ?? ([undefined, signature].includes(this.signature) ? this.plotted : []);
     this.signature = signature;
     this.interval = Number($("interval").value);
     this.began = this.polls = false;
