@@ -7,6 +7,7 @@ import csv
 import io
 import json
 import re
+import threading
 import time
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -19,7 +20,7 @@ from playwright.sync_api import Error, expect
 
 from holdfast.gateway.streams import views
 from holdfast.tags import Tag, TagList
-from support import gateway_pages
+from support import gateway_pages, wire
 from support.fake_device import HANG_UP, FakeDevice, registers
 from support.gateway_pages import DESK, Opened, Pages, View, floats, opening
 
@@ -133,6 +134,34 @@ def test_a_part_is_removed_from_the_view(opened: Opened) -> None:
     view.button("Remove Holding registers 0 to 3 from the view").click()
     view.says("Watching 4 tags, every 50 ms.")
     expect(view.row(0)).to_have_count(0)
+
+
+LATE = """() => {
+  const wait = window.setTimeout;
+  const passed = (time) => time >= 60_000 && time < 300_000;
+  window.setTimeout = (work, time, ...more) => wait(work, passed(time) ? 0 : time, ...more);
+}"""
+"""As if minutes had passed."""
+
+
+def test_a_list_that_takes_minutes_is_read(opened: Opened) -> None:
+    def slow(pdu: bytes) -> bytes:
+        if pdu[2] == 1:
+            asked.set()
+            assert go_on.wait(wire.DEADLINE)
+        return registers(pdu, 7)
+
+    asked, go_on = threading.Event(), threading.Event()
+    with FakeDevice(slow) as device:
+        view = opened()
+        view.connect(port=device.port)
+        view.says("The device responded")
+        add_tags(view, "name,area,address\nlevel,hr,1")
+        view.page.evaluate(LATE)
+        view.button("Read").click()
+        assert asked.wait(wire.DEADLINE)
+        go_on.set()
+        expect(tag(view, "level")).to_have_text("7")
 
 
 def test_a_list_with_errors_is_not_added(opened: Opened) -> None:

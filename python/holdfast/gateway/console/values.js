@@ -26,8 +26,8 @@ const CSV = ["time", "part", "name", "area", "address", "type", "order", "value"
 const CHECK = 1000;
 /** The most bytes of all parts: the body of a request has 64 KiB, with the device and the settings. */
 const MAX_PARTS_SIZE = 63 * 1024;
-/** How long the first poll of a tag list may take, in milliseconds. */
-const LONG = 60_000;
+/** How long the first poll of a tag list may take, in milliseconds: each of its tags may need a request. */
+const LONG = 15 * 60_000;
 
 /** The values view. `gateway.allowsWrites` is `null` until `gateway.refresh()` has found out. */
 export class Values {
