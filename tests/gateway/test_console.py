@@ -1568,6 +1568,30 @@ def test_a_watch_goes_on_when_the_gateway_is_back(opened: Opened) -> None:
     view.says("Stopped.")
 
 
+SILENT_AFTER = 20_000
+"""The time after which a stream without a byte is given up."""
+
+
+def test_a_watch_goes_on_when_its_connection_is_dead(opened: Opened) -> None:
+    device = Registers()
+    with FakeDevice(device) as plc:
+        view = opened()
+        with contextlib.closing(Proxy(view.gateway.address[1], "http")) as proxy:
+            view.gateway.url = proxy.url
+            view.requests.clear()
+            view.open().page.evaluate(PAUSES, [SILENT_AFTER, 2000])
+            read_registers(view, plc.port)
+            view.choose(interval="50")
+            view.button("Watch").click()
+            view.says("Watching holding registers 0 to 9")
+            proxy.hold()
+            view.says("The gateway ended the watch or does not answer. The watch resumes")
+            device.values[5] = 2222
+            proxy.go_on()
+            view.says("Watching holding registers 0 to 9")
+            expect(view.row(5).get_by_role("cell").first).to_have_text("2222")
+
+
 LABELS = """
 () => {
   const fill = CanvasRenderingContext2D.prototype.fillText;

@@ -8,7 +8,10 @@ import { answer, Problem, sendJson } from "./api.js";
  */
 export const MAX_STREAMS = { watch: 4, map: 5 };
 
-/** Asks for a stream, and calls `onEvent(name, data)` for each of its events, until it ends. */
+/** How long a stream may be silent, in milliseconds. The gateway sends something every 5 s, or the connection is dead. */
+const SILENCE = 20_000;
+
+/** Asks for a stream, and calls `onEvent(name, data)` for each of its events, until it ends or is silent. */
 export async function stream(path, body, options, onEvent) {
   const reply = await sendJson(path, body, options);
   if (!(reply.headers.get("Content-Type") ?? "").startsWith("text/event-stream")) {
@@ -19,10 +22,11 @@ export async function stream(path, body, options, onEvent) {
   let held = "";
   try {
     for (;;) {
+      const alarm = setTimeout(() => reader.cancel(), SILENCE);
       const { value, done } = await reader.read().catch((error) => {
         if (error.name === "AbortError") throw error;
         throw new Problem("gateway_gone", "the connection to the gateway ended");
-      });
+      }).finally(() => clearTimeout(alarm));
       if (done) return;
       const events = (held + value).split("\n\n");
       held = events.pop();
