@@ -798,6 +798,20 @@ def test_the_whole_view_is_in_the_link(opened: Opened) -> None:
     expect(view.button("Watch")).to_have_attribute("aria-pressed", "false")
 
 
+def test_a_page_that_was_watching_waits_for_its_device(opened: Opened) -> None:
+    meter = Meter()
+    with FakeDevice(meter) as device:
+        view = watched(opened, device.port)
+        meter.is_off = True
+        view.page.reload()
+        view.says("The device closed the connection.")
+        view.says("Retrying…")
+        view.page.route("**/watch/view", lambda route: route.abort(), times=1)
+        meter.is_off = False
+        view.says("The gateway ended the watch or does not answer. The watch resumes")
+        view.says("Watching holding registers 0 to 0")
+
+
 def test_a_damaged_link_is_told(opened: Opened) -> None:
     view = opened()
     view.page.goto(

@@ -1,10 +1,10 @@
 // The console: connects to a device, and switches between its views.
 
 import { forgetToken, get, hasToken, notice, post, unmark } from "./api.js";
-import { $, h, say, tabs } from "./dom.js";
+import { $, h, pause, say, tabs } from "./dom.js";
 import * as pageUrl from "./page_url.js";
 import { Discovery } from "./discovery.js";
-import { Values } from "./values.js";
+import { FINAL, RESUME, Values } from "./values.js";
 
 const gateway = { allowsWrites: null, refresh: loadGatewaySettings };
 /** Errors of the probe after which other areas may still respond. */
@@ -61,7 +61,7 @@ async function begin() {
   const isDamaged = flaws.length > 0;
   const isWatched = await values.recall(flaws);
   if (failed !== null || isDamaged) say($("connection"), failed, ...(isDamaged ? values.flaws : []));
-  if (isWatched && !isDamaged && $("device").checkValidity()) connect();
+  if (isWatched && !isDamaged && $("device").checkValidity()) connect(true);
 }
 
 /** Stores the device in the page's URL, so that it can be bookmarked and shared. */
@@ -81,25 +81,32 @@ function chooseTransport() {
   if ($("port").value === other) $("port").value = usual;
 }
 
-async function connect() {
+/** Connects. With `again`, it tries until the device responds: a page that was watching resumes, as a watch does. */
+async function connect(again = false) {
   disconnect();
   remember();
   const asked = target();
   const aborting = new AbortController();
   connecting = aborting;
   say($("connection"), "Connecting…");
-  try {
-    await loadGatewaySettings();
-    const began = performance.now();
-    const found = await post("/api/modbus/connect", asked, { signal: aborting.signal });
-    if (connecting !== aborting) return;
-    const took = Math.round(performance.now() - began);
-    if (found.exception) selectDevice(asked, `The device responded in ${took} ms, but can't read holding register 0: ${found.exception}. Other areas may work.`);
-    else selectDevice(asked, `The device responded in ${took} ms.`);
-  } catch (error) {
-    if (connecting !== aborting) return;
-    connecting = null;
-    say($("connection"), notice(error), UNPROVEN.has(error.reason) ? offer(asked) : null);
+  let told = null;
+  while (connecting === aborting) {
+    try {
+      await loadGatewaySettings();
+      const began = performance.now();
+      const found = await post("/api/modbus/connect", asked, { signal: aborting.signal });
+      if (connecting !== aborting) return;
+      const took = Math.round(performance.now() - began);
+      if (found.exception) selectDevice(asked, `The device responded in ${took} ms, but can't read holding register 0: ${found.exception}. Other areas may work.`);
+      else selectDevice(asked, `The device responded in ${took} ms.`);
+    } catch (error) {
+      if (connecting !== aborting) return;
+      const retries = again && !FINAL.has(error.reason);
+      if (!retries) connecting = null;
+      if (error.message !== told) say($("connection"), notice(error), retries ? "Retrying…" : null, UNPROVEN.has(error.reason) ? offer(asked) : null);
+      told = error.message;
+      if (retries) await pause(RESUME);
+    }
   }
 }
 

@@ -18,10 +18,11 @@ import { Writer } from "./write_dialog.js";
 const SLACK = 2 * 1000;
 
 const PATH = "/api/modbus/watch/view";
-const RESUME = 1000;
+/** How long a watch waits before it retries, in milliseconds. */
+export const RESUME = 1000;
 const WRITTEN = { written: "Written", refused: "Not written", unknown: "Unknown whether it was written" };
 /** Errors after which a watch does not retry. */
-const FINAL = new Set(["malformed", "refused_target", "unauthorized", "foreign_page", "not_found"]);
+export const FINAL = new Set(["malformed", "refused_target", "unauthorized", "foreign_page", "not_found"]);
 const CSV = ["time", "part", "name", "area", "address", "type", "order", "value", "unit", "state", "error"];
 const CHECK = 1000;
 /** The most bytes of all parts: the body of a request has 64 KiB, with the device and the settings. */
@@ -119,7 +120,7 @@ export class Values {
     $("save").hidden = true;
     say($("outcome"), ...this.flaws);
     // What is left of a damaged link is not what was asked for.
-    if (this.resumes && this.flaws.length === 0) this.watch(this.wanted());
+    if (this.resumes && this.flaws.length === 0) this.watch(this.wanted(), null, true);
     this.resumes = false;
   }
 
@@ -337,8 +338,11 @@ export class Values {
     }
   }
 
-  /** Watches parts until it is stopped. Asks again when the request ends or is aborted, and polls without streams. */
-  async watch(wanted, plotted = null) {
+  /**
+   * Watches parts until it is stopped. Asks again when the request ends or is aborted, and polls without streams. If the
+   * first request fails, it ends, unless it is to try `again`.
+   */
+  async watch(wanted, plotted = null, again = false) {
     this.stop();
     const watch = { request: null };
     this.watching = watch;
@@ -384,7 +388,7 @@ export class Values {
       } catch (error) {
         if (this.watching !== watch) return;
         if (signal.aborted) continue;
-        if (!this.began || FINAL.has(error.reason)) {
+        if (!(this.began || again) || FINAL.has(error.reason)) {
           this.stop();
           this.panels.forEach((panel) => panel.stale("The watch has ended."));
           say($("outcome"), notice(error));
