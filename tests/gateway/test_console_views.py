@@ -839,6 +839,7 @@ def test_a_damaged_link_is_told(opened: Opened) -> None:
         ("address=4OO", "address is “4OO”"),
         ("part=4,1000,2,uint16,ABCD&interval=abc", "interval is “abc”"),
         ("part=4,1000,2,constructor,ABCD", "“4,1000,2,constructor,ABCD” is not a range"),
+        ("part=1,0,10,float32,ABCD", "“1,0,10,float32,ABCD” is not a range"),
     ],
 )
 def test_what_is_left_of_a_damaged_link_is_not_watched(

@@ -110,7 +110,7 @@ export async function readPart(text) {
   const [area, address, quantity] = [first, rest[0], rest[1]].map(Number);
   const [kind, size] = (rest[2] ?? "").split(":");
   const type = ["bit", "string", "bytes"].includes(kind) || Object.hasOwn(TYPES, kind) ? typeOf(kind, Number(size)) : null;
-  const whole = [area, address, quantity].every(Number.isInteger) && type?.width > 0;
+  const whole = [area, address, quantity].every(Number.isInteger) && type?.width > 0 && (area > 2 || kind === "bool");
   if (!whole || !areaOf(area) || address < 0 || quantity < 1 || address + quantity > LAST_ADDRESS + 1 || quantity > areaOf(area).most) {
     throw new Error(`“${text}” is not a range`);
   }
