@@ -1486,6 +1486,10 @@ def test_a_range_is_checked_before_it_is_watched_or_read(opened: Opened) -> None
         view.button("Watch").click()
         expect(view.page.locator(f"#{wrong}")).to_be_focused()
         expect(view.button("Watch")).to_have_attribute("aria-pressed", "false")
+        if wrong != "interval":
+            view.page.locator("#area").focus()
+            view.button("Read").click()
+            expect(view.page.locator(f"#{wrong}")).to_be_focused()
     assert [url for url in view.requests if "/watch" in url] == []
 
 

@@ -124,6 +124,16 @@ def test_ranges_and_tags_are_watched_in_one_stream(
     view.check()
 
 
+def test_a_view_is_read_and_watched_without_the_range_of_the_form(opened: Opened) -> None:
+    view = connected(opened)
+    add_tags(view, METER)
+    view.choose(quantity="")
+    view.button("Read").click()
+    view.says("4 tags: read in")
+    view.button("Watch").click()
+    view.says("Watching 4 tags")
+
+
 def test_a_part_is_removed_from_the_view(opened: Opened) -> None:
     view = connected(opened)
     view.choose(quantity="4", interval="50")

@@ -44,7 +44,8 @@ export class Values {
     this.turn = 0;
     $("range").addEventListener("submit", (event) => {
       event.preventDefault();
-      this.read(this.wanted());
+      // The parts of a view are read without the form.
+      if (this.pinned.length > 0 || $("range").reportValidity()) this.read(this.wanted());
     });
     $("range").addEventListener("input", () => {
       this.adapt();
@@ -57,7 +58,7 @@ export class Values {
     });
     $("watch").addEventListener("click", () => {
       if (this.watching) this.stop();
-      else if ($("range").reportValidity()) this.watch(this.wanted());
+      else if ($(this.pinned.length > 0 ? "interval" : "range").reportValidity()) this.watch(this.wanted());
     });
     $("add-range").addEventListener("click", () => {
       if (!$("range").reportValidity()) return;
