@@ -469,12 +469,13 @@ def test_a_write_that_is_sent_again_has_the_outcome_of_the_first(
         found = again.result(wire.DEADLINE)
         first.close()
         assert len(device.asked) == 1
-    status, reason = {
-        "is answered": (200, None),
-        "is alone": (409, "repeated"),
-        "ends": (503, "stopping"),
-    }[then]
-    assert (found.status, found.headers.get("holdfast-reason")) == (status, reason)
+    reason = found.headers.get("holdfast-reason")
+    allowed: dict[str, list[tuple[int, str | None]]] = {
+        "is answered": [(200, None)],
+        "is alone": [(409, "repeated")],
+        "ends": [(503, "stopping"), (409, "repeated")],  # The first may end earlier.
+    }
+    assert (found.status, reason) in allowed[then]
     assert found.headers.get("holdfast-maybe-written") == (None if reason is None else "true")
 
 
