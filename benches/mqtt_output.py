@@ -178,7 +178,7 @@ def holdfast(port: int, count: int, payload: str) -> str:
     buffer, stop = Buffer(), Stop()
     sending = Sending("bench", output, buffer)
     thread = threading.Thread(target=sending.run, args=[stop])
-    output.until(stop)
+    output.use_stop(stop)
     output.idle()  # Connects.
     changes = readings(count)
     thread.start()
