@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 from datetime import datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -300,6 +301,64 @@ def test_what_was_refused_is_published_once_the_broker_accepts_it(
         }
         while missing:
             missing.discard(probe.get().topic)
+
+
+def test_only_the_entity_that_was_refused_is_published_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sending, "RENEWAL_INTERVAL_S", 0.05)
+    own, rules = "homeassistant/{}/holdfast_home/pump-{}/config", tmp_path / "acl"
+    rules.write_text(f"topic readwrite #\ntopic deny {own.format('sensor', 'address')}\n")
+    with Plant(tmp_path, "allow_anonymous true", f"acl_file {rules}") as plant:
+        plant.device()
+        probe = plant.probe("#")
+        plant.run(discovery="homeassistant")
+        wire.until(lambda: plant.status().get("not_accepted", 0) >= 4, "refused again")
+        probe.publish("end", "1")
+        seen = probe.until("end", "1")
+    assert len(texts(seen, own.format("binary_sensor", "connection"))) == 1
+    assert texts(seen, "plant/holdfast/status/pump").count("online") == 1
+
+
+def test_a_removal_that_was_refused_is_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sending, "RENEWAL_INTERVAL_S", 0.05)
+    rules = tmp_path / "acl"
+    rules.write_text("topic readwrite #\n")
+    output: dict[str, Any] = {"discovery": "homeassistant"}
+    values = itertools.count(1)
+    with Plant(tmp_path, "allow_anonymous true", f"acl_file {rules}") as plant:
+        device = plant.device()
+        plant.device("fan")
+
+        def refuses_values() -> bool:
+            device.set(next(values))
+            return plant.count("refused") > 0
+
+        def has_refused_others() -> bool:
+            not_accepted = int(plant.status().get("not_accepted", 0))
+            return not_accepted - plant.count("refused") >= 5
+
+        probe = plant.probe("#")
+        appliance = plant.run(**output)
+        wire.until(lambda: plant.count("sent") >= 8, "all is published")
+        rules.write_text("topic read #\n")
+        plant.broker.reload()
+        wire.until(refuses_values, "the broker has read the list")
+        appliance.reload(plant.config({**output, "devices": ["pump"]}))
+        wire.until(has_refused_others, "the removal is refused")
+        rules.write_text("topic readwrite #\n")
+        plant.broker.reload()
+        missing = {
+            "plant/fan/valve",
+            "plant/holdfast/status/fan",
+            "homeassistant/sensor/holdfast_home/fan--flow/config",
+        }
+        while missing:
+            message = probe.get()
+            if not message.payload:
+                missing.discard(message.topic)
 
 
 def test_a_refused_message_that_has_no_value_is_reported_too(

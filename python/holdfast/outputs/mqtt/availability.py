@@ -61,6 +61,15 @@ class Availability:
         self._repeated_at = -inf
         self._is_due.set()
 
+    def forget(self, topics: Set[str]) -> None:
+        """Forgets what was published to these topics: the broker refused it."""
+        if self._names.status in topics:
+            self._is_due.set()
+        for device in [*self._answering]:
+            if self._names.of_availability(device) in topics:
+                del self._answering[device]
+                self._answers = -1
+
     def keep(self, devices: Set[str]) -> None:
         """Forgets all other devices."""
         for device in self._answering.keys() - devices:

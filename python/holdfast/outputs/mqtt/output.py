@@ -60,8 +60,9 @@ class MqttOutput(BrokerReceiver):
         """Whether the broker has confirmed values since all were offered again."""
         self._refused: dict[bytes, str] = {}
         """The topics of new refusals of the broker, with its reasons."""
-        self._has_lost, self._renewed_at = False, -inf
-        """Whether some are of availability or entities, and when all of them were repeated."""
+        self._lost: set[str] = set()
+        """Those of availability, entities and removals, until these are repeated."""
+        self._renewed_at = -inf
 
     def send(self, readings: list[Reading]) -> None:
         """Publishes readings, and waits until the broker has confirmed them.
@@ -126,6 +127,7 @@ class MqttOutput(BrokerReceiver):
         self._availability.begin()
         self._revision = -1
         self._entities = {}
+        self._removal, self._lost = None, set()
         # Some brokers end the connection of a program that may only publish.
         if self._settings.writes or self._discovery is not None:
             session.subscribe([self._topics.status], retained=False)
@@ -136,11 +138,6 @@ class MqttOutput(BrokerReceiver):
 
     def _keep_up(self, session: Session) -> None:
         """Publishes what has to be known before values."""
-        now = time.monotonic()
-        if self._has_lost and now >= self._renewed_at + sending.RENEWAL_INTERVAL_S:
-            self._has_lost, self._renewed_at = False, now
-            self._availability.begin()
-            self._is_born.set()
         self._forget_removed()
         revision = self._site.revision
         if revision != self._revision:
@@ -151,6 +148,7 @@ class MqttOutput(BrokerReceiver):
                 self._is_born.clear()
                 self._publish(session, self._entities)
             self._remove_stale(session)
+        self._repeat_lost(session)
         # In this order: the broker may have kept that a device answers from the run before.
         self._publish_availability(session, answering=False)
         if online := self._availability.online():
@@ -170,7 +168,7 @@ class MqttOutput(BrokerReceiver):
         before = self._entities
         if self._discovery is not None:
             self._entities = self._discovery.entities(tags, self._site.devices())
-        self._removal = self._publish(session, self._gone())
+        self._remove_gone(session)
         self._availability.keep(names.keys())
         if self._discovery is None:
             return
@@ -183,29 +181,49 @@ class MqttOutput(BrokerReceiver):
         if not before:
             session.subscribe([self._discovery.filter], retained=True)
 
-    def _gone(self) -> dict[str, bytes]:
-        """Messages that remove what this output, or the one before it, has published and does not
-        publish any more. Another output may do so now: that topic stays.
+    def _remove_gone(self, session: Session) -> None:
+        """Removes what this output, or the one before it, has published and does not publish any
+        more. Another output may do so now: that topic stays.
         """
-        retained, own = self._site.retained, (self._broker, self._name)
         # In this order, so that values of a tag end before its entity.
         wanted = dict.fromkeys([*self._topics_of(self._tags), *self._entities])
         for topic in wanted:
-            retained[self._broker, topic] = self._name
-        known = [*retained.items()]  # A copy, because other outputs change it at any time.
-        return {
-            topic: b"" for (at, topic), name in known if (at, name) == own and topic not in wanted
-        }
+            self._site.retained[self._broker, topic] = self._name
+        gone = {topic: b"" for topic in self._retained() if topic not in wanted}
+        self._removal = self._publish(session, gone)
+
+    def _retained(self) -> list[str]:
+        """The topics that this output, or the one before it, has published and not removed."""
+        own = self._broker, self._name
+        known = [*self._site.retained.items()]  # A copy: other outputs change it at any time.
+        return [topic for (at, topic), name in known if (at, name) == own]
 
     def _forget_removed(self) -> None:
-        """Forgets topics once the broker has confirmed that they are removed."""
+        """Forgets topics once the broker has removed them. Those that it refused stay."""
         removal = self._removal
         if removal is None or not removal.is_done:
             return
         self._removal = None
-        for topic in (unpacked_topic(message.topic) for message in removal.messages):
+        for message in removal.messages:
+            topic = unpacked_topic(message.topic)
+            if message.topic in self._refused or topic in self._lost:
+                continue
             if self._site.retained.get((self._broker, topic)) == self._name:
                 del self._site.retained[self._broker, topic]
+
+    def _repeat_lost(self, session: Session) -> None:
+        """Publishes again what the broker has refused, and nothing else: it may be refused again.
+
+        Removals under way come first: which of them it refuses is known once they are done.
+        """
+        if not self._lost or self._removal is not None:
+            return
+        if (now := time.monotonic()) < self._renewed_at + sending.RENEWAL_INTERVAL_S:
+            return
+        lost, self._lost, self._renewed_at = self._lost, set(), now
+        self._availability.forget(lost)
+        self._publish(session, {key: each for key, each in self._entities.items() if key in lost})
+        self._remove_gone(session)
 
     def _on_refused(self, message: Message, reason: str) -> None:
         super()._on_refused(message, reason)
@@ -214,7 +232,7 @@ class MqttOutput(BrokerReceiver):
     def _settle_refused(self, readings: Sequence[Reading]) -> None:
         """Raises `Refused` for readings that the broker did not accept.
 
-        Notes whether it refused availability or entities. Replies to commands are not repeated.
+        Notes what else it refused, but replies to commands: they are not repeated.
         """
         refused: dict[bytes, str] = {}
         while self._refused:  # Filled by the thread of the connection.
@@ -223,8 +241,8 @@ class MqttOutput(BrokerReceiver):
         if not refused:
             return
         names = self._topics
-        own = {names.status, *map(names.of_availability, self._tags), *self._entities}
-        self._has_lost |= not own.isdisjoint(map(unpacked_topic, refused))
+        own = {names.status, *map(names.of_availability, self._tags), *self._retained()}
+        self._lost |= own.intersection(map(unpacked_topic, refused))
         lost = [each for each in readings if self._payloads.topic(each) in refused]
         if lost:
             topic = self._payloads.topic(lost[0])
@@ -242,12 +260,11 @@ class MqttOutput(BrokerReceiver):
 
     def _remove_stale(self, session: Session) -> None:
         """Removes entities of an earlier configuration, which the broker has kept."""
-        stale: dict[str, bytes] = {}
+        if not self._found or self._removal is not None:
+            return
         while self._found:
-            topic = self._found.popleft()
-            if topic not in self._entities:
-                stale[topic] = b""
-        self._publish(session, stale)
+            self._site.retained[self._broker, self._found.popleft()] = self._name
+        self._remove_gone(session)
 
     @staticmethod
     def _publish(session: Session, retained: Mapping[str, bytes]) -> Delivery | None:
