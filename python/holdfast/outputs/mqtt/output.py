@@ -138,6 +138,11 @@ class MqttOutput(BrokerReceiver):
 
     def _keep_up(self, session: Session) -> None:
         """Publishes what has to be known before values."""
+        # In this order: the broker may have kept that a device answers from the run before. And
+        # before entities, which may take long.
+        self._publish_availability(session, answering=False)
+        if online := self._availability.online():
+            session.publish([online])
         self._forget_removed()
         revision = self._site.revision
         if revision != self._revision:
@@ -149,10 +154,6 @@ class MqttOutput(BrokerReceiver):
                 self._publish(session, self._entities)
             self._remove_stale(session)
         self._repeat_lost(session)
-        # In this order: the broker may have kept that a device answers from the run before.
-        self._publish_availability(session, answering=False)
-        if online := self._availability.online():
-            session.publish([online])
 
     def _adopt(self, session: Session, tags: Mapping[str, Sequence[Tag]]) -> None:
         """Takes over the tags: of the first configuration, and after each reload."""
