@@ -151,6 +151,7 @@ def test_no_two_tags_have_one_id() -> None:
         (tag(area="holding_registers", writable=True, min=-5, max=30), 30.5, "None"),
         (tag(area="holding_registers", writable=True, min=-5, max=30), None, "None"),
         (tag(area="holding_registers", type="float32", writable=True), -math.inf, "None"),
+        (tag(area="holding_registers", type="uint64", writable=True), 2**64 - 1, str(2**64 - 1)),
         (tag(type="uint16", states=STATES), 1, "it's on"),
         (tag(type="uint16", states=STATES), 7, "None"),
         (tag(type="uint16", scale=0.5, states=STATES), 1.0, "it's on"),
@@ -299,6 +300,14 @@ def test_a_reload_with_another_prefix_or_without_discovery_removes_all_entities(
     assert configs(plant)
     appliance.reload(plant.config(after))
     wire.until(lambda: not configs(plant), "all are removed")
+
+
+def test_the_output_is_online_before_its_entities_are_published(plant: Plant) -> None:
+    plant.device()
+    probe = plant.probe("#")
+    plant.run(discovery="homeassistant")
+    seen = probe.until("plant/holdfast/status", "online")
+    assert not [each for each in seen if each.topic.startswith("homeassistant/")]
 
 
 @pytest.mark.parametrize("version", ["5", "3.1.1"])

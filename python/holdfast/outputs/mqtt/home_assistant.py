@@ -229,7 +229,7 @@ class Discovery:
         named = bool(tag.states)
         if form == "plain":
             known = f"in {_listed(tag.states.values())}" if named else "!= ''"
-            known += _within(own, "float(value)")
+            known += _within(own, "value")
             template = f"{{{{ value if value {known} else '{NONE}' }}}}"
             return {"state_topic": self._names.of_tag(device, tag.name), "value_template": template}
         if form == "json":
@@ -262,8 +262,13 @@ def _bounds(tag: Tag) -> dict[str, float]:
 
 
 def _within(own: dict[str, Any], value: str) -> str:
-    """A condition in a template: the bounds of an entity, if it has some."""
-    return f" and {own['min']} <= {value} <= {own['max']}" if "min" in own else ""
+    """A condition in a template: the bounds of an entity, if it has some.
+
+    All are floats: as one, an integer of 64 bits may be larger than itself.
+    """
+    if "min" not in own:
+        return ""
+    return f" and {float(own['min'])} <= float({value}) <= {float(own['max'])}"
 
 
 def _listed(names: Any) -> str:
