@@ -277,7 +277,9 @@ def test_a_comment_that_is_no_device_ends_neither_device_nor_poll(
 
 
 @pytest.mark.parametrize(
-    ("second", "gap"), [(10, 7), (17, 6), (40, 7)], ids=["adjacent", "near", "far"]
+    ("second", "gap"),
+    [(10, 7), (11, 1), (16, 6), (17, 7), (40, 7)],
+    ids=["adjacent", "one between", "near", "as near as tags", "far"],
 )
 def test_addresses_that_no_poll_read_are_not_read(
     read: Callable[[str], Imported], second: int, gap: int

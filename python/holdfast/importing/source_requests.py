@@ -30,20 +30,21 @@ def read_settings(
 ) -> dict[str, int]:
     """The settings of a device whose tags are in these requests.
 
-    A gap is read if one of them read it. Those that follow each other would be joined: the largest
-    is the limit.
+    A gap between tags is read if one of them read it, unless that joins others that contain an
+    address that none read. Requests that follow each other would be joined: the largest is the
+    limit.
     """
     inside, between = [0], [ADDRESSES]
     stretches: list[Request] = []
     for area in AREAS:
         ranges = [each for of, each in requests if of == area]
-        stretches += [(area, each) for each in joined(ranges)]
-        between += [len(gap) for gap in _gaps(ranges)]
-        inside += [
-            len(gap)
-            for gap in _gaps(_addresses(tag) for tag in tags if tag["area"] == area)
-            if any(each.start <= gap.start and gap.stop <= each.stop for each in ranges)
-        ]
+        read = joined(ranges)
+        stretches += [(area, each) for each in read]
+        for gap in _gaps(_addresses(tag) for tag in tags if tag["area"] == area):
+            if _has(ranges, gap):
+                inside.append(len(gap))
+            elif not _has(read, gap):
+                between.append(len(gap))
     settings = {"max_gap": min(max(inside), min(between) - 1)}
     for key, (most, areas) in _LIMITS.items():
         largest, longest = (
@@ -68,6 +69,11 @@ def joined(ranges: Iterable[range], max_gap: int = 0) -> list[range]:
 
 def _gaps(ranges: Iterable[range]) -> list[range]:
     return [range(before.stop, after.start) for before, after in pairwise(joined(ranges))]
+
+
+def _has(ranges: Iterable[range], gap: range) -> bool:
+    """Whether one of the ranges contains a whole gap."""
+    return any(each.start <= gap.start and gap.stop <= each.stop for each in ranges)
 
 
 def _addresses(tag: Mapping[str, Any]) -> range:
