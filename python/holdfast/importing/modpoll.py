@@ -223,7 +223,8 @@ def _leave_out_replaced(desk: Desk, device: _Device) -> None:
             desk.withdraw(each.path)
             message = f"line {line} has this name, too: the last counts, as in modpoll"
             desk.left_out(each.path, message)
-    device.tags = [each for each in device.tags if each[0] in last.values()]
+    kept = set(last.values())
+    device.tags = [each for each in device.tags if each[0] in kept]
 
 
 def _integer(text: str) -> int | None:
