@@ -318,7 +318,6 @@ def test_workarounds_and_retries(imported: Callable[[str], Imported]) -> None:
     pause_after_connect = "2s"
     pause_between_requests = "20ms"
     close_connection_after_gather = true
-    one_request_per_field = true
     max_word_registers_per_request = 20
     max_bit_registers_per_request = 100
 """
@@ -337,8 +336,6 @@ def test_workarounds_and_retries(imported: Callable[[str], Imported]) -> None:
         "0.1 s; see pause of tolerance",
         "21: inputs.modbus[0].workarounds.close_connection_after_gather: left out: the "
         "connection stays open: with close_after, each request would wait for pause_after_connect",
-        "22: inputs.modbus[0].workarounds.one_request_per_field: left out: requests are planned "
-        "from all tags; see max_registers and max_bits",
     ]
 
 
@@ -969,6 +966,30 @@ def test_requests_are_no_longer_than_those_of_the_source(
     line = imported(REQUEST + more % (6, 10) + given).data["devices"]["line-1"]
     assert line["max_registers"] == 20
     assert "max_registers" not in device(imported(changed("address=20,", "address=10,", METRIC)))
+
+
+@pytest.mark.parametrize("optimization", ["none", "max_insert", "aggressive"])
+def test_with_one_request_per_field_none_is_longer_than_a_field(
+    imported: Callable[[str], Imported], optimization: str
+) -> None:
+    fields = ",".join(f'{{address={each}, name="a{each}", type="INT16"}}' for each in range(3))
+    text = f"""\
+  [[inputs.modbus.request]]
+    slave_id = 1
+    optimization = "{optimization}"
+    fields = [{fields}]
+  [inputs.modbus.workarounds]
+    one_request_per_field = true
+    max_word_registers_per_request = 20
+"""
+    found = imported(REQUEST[: REQUEST.index("  [[")] + text)
+    assert (device(found)["max_registers"], device(found)["max_gap"]) == (1, 0)
+    assert notes(found) == [
+        "11: inputs.modbus[0].workarounds.one_request_per_field: changed: no request is longer "
+        "than the longest field; shorter ones may share one",
+        "12: inputs.modbus[0].workarounds.max_word_registers_per_request: left out: "
+        "one_request_per_field makes requests as short as fields",
+    ]
 
 
 def test_a_single_table_is_an_input_too(imported: Callable[[str], Imported]) -> None:

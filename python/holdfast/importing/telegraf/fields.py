@@ -124,10 +124,11 @@ class Unit:
     reads: dict[Area, list[range]] = field(default_factory=dict)
     """What fields read that are in no request yet."""
 
-    def join(self, max_gap: int = 0) -> None:
-        """Makes requests of what fields read."""
+    def join(self, max_gap: int | None) -> None:
+        """Makes requests of what fields read: with `None` one for each field."""
         for area, ranges in self.reads.items():
-            self.requests += [(area, each) for each in joined(ranges, max_gap)]
+            made = ranges if max_gap is None else joined(ranges, max_gap)
+            self.requests += [(area, each) for each in made]
         self.reads = {}
 
     def series(self) -> list[tuple[str, list[Field]]]:
@@ -165,6 +166,7 @@ class Fields:
     source: Section
     location: str | None = None
     """Which bytes of a register contain text: `lower`, `upper`, or both."""
+    one_request_per_field: bool = False
     units: dict[int, Unit] = field(default_factory=dict)
 
     def read(self) -> str:
@@ -200,7 +202,7 @@ class Fields:
         for area in _AREAS.values():
             for entry in self.source.sections(area):
                 self._register(unit, entry, area)
-        unit.join()
+        unit.join(None if self.one_request_per_field else 0)
 
     def _register(self, unit: Unit, entry: Section, area: Area) -> None:
         name = entry.name("name", required=True)
@@ -320,11 +322,13 @@ class Fields:
             for each in fields:
                 each.point_tags, each.tagged_at = tags, section.at("tags")
 
-    def _gap(self, section: Section, default: int | None) -> int:
-        """The largest gap that the source read to join two fields."""
+    def _gap(self, section: Section, default: int | None) -> int | None:
+        """The largest gap that the source read to join two fields; `None` if it joined none."""
         allowed = ("none", "shrink", "rearrange", "aggressive", "max_insert")
         kind = word(section, "optimization", allowed)
         fill = section.integer("optimization_max_register_fill", 0, 2000)
+        if self.one_request_per_field:
+            return None
         if kind == "aggressive":
             message = f"gaps of up to {DEFAULT_MAX_GAP} are read; see max_gap of the device"
             section.changed("optimization", message)

@@ -86,9 +86,9 @@ class InputReader:
         name = one.name("name", required=True) or "device"
         url = self._url()
         timing = {"interval": self._interval(), "timeout": self._timeout()}
-        location = self._workarounds()
+        location, one_request_per_field = self._workarounds()
         self._read_busy_retries()
-        fields = Fields(one, location)
+        fields = Fields(one, location, one_request_per_field)
         style = fields.read()
         self._rename_measurements(fields)
         others = {key for each in STYLES if each != style for key in STYLES[each]}
@@ -156,11 +156,13 @@ class InputReader:
             message = f"{min(times, MAX_RETRIES)} retries, also after timeouts and lost connections"
             self.input.changed("busy_retries", message)
 
-    def _workarounds(self) -> str | None:
-        """Reads the table of workarounds. Returns where text is in registers."""
+    def _workarounds(self) -> tuple[str | None, bool]:
+        """Reads the table of workarounds. Returns where text is in registers, and whether each
+        field has a request of its own.
+        """
         table = self.input.mapping("workarounds")
         if table is None:
-            return None
+            return None, False
         for key, option in (
             ("pause_after_connect", "pause_after_connect"),
             ("pause_between_requests", "pause"),
@@ -172,22 +174,27 @@ class InputReader:
                 self.tolerance[option] = pause
         if table.flag("close_connection_after_gather"):
             self.tolerance["close_after"] = 1
+        if one_request_per_field := bool(table.flag("one_request_per_field")):
+            message = "no request is longer than the longest field; shorter ones may share one"
+            table.changed("one_request_per_field", message)
         for key, option, most in (
             ("max_bit_registers_per_request", "max_bits", READ_BITS),
             ("max_word_registers_per_request", "max_registers", READ_REGISTERS),
         ):
-            if number := table.integer(key, 0, most):
+            number = table.integer(key, 0, most)
+            if number and one_request_per_field:
+                table.left_out(key, "one_request_per_field makes requests as short as fields")
+            elif number:
                 self.limits[option] = number
         location = table.text("string_register_location")
         if location not in (None, "both", "lower", "upper"):
             message = f"found {show(location)}, allowed: both, lower or upper"
             table.problem("string_register_location", message)
-        for key in ("one_request_per_field", "read_coils_starting_at_zero"):
-            if table.flag(key):
-                message = "requests are planned from all tags; see max_registers and max_bits"
-                table.left_out(key, message)
+        if table.flag("read_coils_starting_at_zero"):
+            message = "requests are planned from all tags; see max_registers and max_bits"
+            table.left_out("read_coils_starting_at_zero", message)
         table.close()
-        return location
+        return location, one_request_per_field
 
     def _url(self) -> str | None:
         """The URL of the controller."""
