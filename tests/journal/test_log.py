@@ -71,18 +71,6 @@ def test_pipelined_writes_keep_their_order(node: Start) -> None:
     assert a.read(0) == 99
 
 
-def test_a_client_that_closes_its_sending_side_gets_all_replies(node: Start) -> None:
-    """Of more writes than are given to the log at once, and than are read before."""
-    a = node("a")
-    writes = [b"\x06\0\0" + number.to_bytes(2) for number in range(1000)]
-    with wire.Connection(a.address) as connection:
-        connection.send(wire.frames(writes))
-        connection.finish()
-        assert [reply.pdu for reply in connection.receive_many(1000)] == writes
-        assert connection.rest() == b""
-    assert a.read(0) == 999
-
-
 def test_without_a_server_writes_are_refused_and_reads_are_not(
     node: Start, nats: NatsServer
 ) -> None:

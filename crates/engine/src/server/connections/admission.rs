@@ -110,7 +110,7 @@ pub(crate) struct Full;
 pub(crate) enum Evicted {
     Connection(Peer),
     Handshake(Peer),
-    /// It had its last reply, or its peer had sent everything.
+    /// It had its last reply: nothing was lost.
     Answered(Peer),
 }
 
@@ -399,8 +399,7 @@ impl Ticket {
         self.activity.is_amid_exchange.store(is_amid_exchange, Ordering::Relaxed);
     }
 
-    /// Records that the connection has had its last reply, or that its peer has sent everything: it gives its place
-    /// to any other one.
+    /// Records that the connection has had its last reply: it gives its place to any other one.
     pub(crate) fn set_answered(&self) {
         self.activity.is_answered.store(true, Ordering::Relaxed);
     }

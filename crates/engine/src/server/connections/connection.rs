@@ -11,7 +11,7 @@ use std::future::poll_fn;
 use std::io;
 use std::pin::{Pin, pin};
 use std::sync::Arc;
-use std::task::{Context, Poll, ready};
+use std::task::{Context, Poll};
 
 use holdfast_protocol::frame::mbap;
 use holdfast_protocol::pdu;
@@ -31,7 +31,7 @@ use crate::server::reports::refused_request::Reported;
 use crate::server::requests::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
 use crate::server::rights::peer_rights::PeerRights;
 use crate::server::transports::framing::{Ascii, Framing, Mbap, Next, Rtu};
-use crate::server::transports::stream::{self, End, Stream};
+use crate::server::transports::stream::{self, Stream};
 
 /// Bytes per read of a socket, together with those of a connection that wait.
 const INPUT_BYTES: usize = 4096;
@@ -242,8 +242,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             if self.answering.room() == 0 {
                 self.reads_in_turn = 0;
                 (self.is_unaware, self.has_read_all) = (true, false);
-                let end = ready!(stream::poll_end(self.stream.socket(), context));
-                return self.ended_by_peer(end);
+                return stream::poll_end(self.stream.socket(), context).map(Err);
             }
         }
         // Most peers send one request at a time: behind it, there is nothing yet that takes a share.
@@ -275,9 +274,6 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
                 self.reads_in_turn = 0;
                 return Poll::Pending;
             };
-            if read == Err(End::ByPeer) {
-                return self.ended_by_peer(Kind::Closed);
-            }
             self.reads_in_turn += 1;
             let read = read?;
             self.has_read_all = !self.is_unaware && read < room;
@@ -292,17 +288,6 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             }
             Poll::Ready(if answered.broken { Err(Kind::BrokenFrame) } else { Ok(()) })
         })
-    }
-
-    /// The peer has sent everything. It may still wait for what a journal confirms: that is sent first. Or it has
-    /// gone: the connection needs no place meanwhile.
-    fn ended_by_peer(&mut self, end: Kind) -> Poll<Result<(), Kind>> {
-        if !self.answering.deferred.as_ref().is_some_and(|deferred| deferred.is_journaled()) {
-            return Poll::Ready(Err(end));
-        }
-        self.reads_in_turn = 0;
-        self.ticket.set_answered();
-        Poll::Pending
     }
 
     /// Writes replies that have come, and answers what waited for them.

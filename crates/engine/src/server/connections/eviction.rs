@@ -1,6 +1,6 @@
 //! Which connection of a full listener or HTTP host is closed for a new one.
 //!
-//! A session that has had its last reply, or whose peer has sent everything, always gives way. With
+//! A session that has had its last reply always gives way. With
 //! [`WhenFull::Evict`](super::admission::WhenFull::Evict), the others give way in the order of
 //! [`Standing`].
 
@@ -37,7 +37,7 @@ impl Crowd {
         }
     }
 
-    /// The first of these sessions that always give way.
+    /// The first of these sessions that has had its last reply.
     pub(super) fn answered(self, sessions: &HashMap<u64, Held>) -> Option<u64> {
         let is_answered = |held: &Held| {
             held.task.is_some()
@@ -109,8 +109,7 @@ pub(super) struct Activity {
     pub(super) is_busy: AtomicBool,
     /// Whether `last_request` is the time of the last response.
     pub(super) is_served: AtomicBool,
-    /// Whether the connection has had its last reply, and waits for its peer to close; or its peer has sent
-    /// everything, and waits for its last replies at most.
+    /// Whether the connection has had its last reply, and waits for its peer to close.
     pub(super) is_answered: AtomicBool,
     /// Whether the connection must look up its rights again.
     pub(super) is_outdated: AtomicBool,

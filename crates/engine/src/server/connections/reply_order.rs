@@ -49,7 +49,6 @@ pub(in crate::server) struct Waiting {
     is_newest: bool,
     /// What answers it, and keeps the order of what it is asked. Whatever others answer waits.
     answered_by: Discriminant<RequestDestination>,
-    is_journaled: bool,
 }
 
 /// A request that is answered elsewhere.
@@ -88,11 +87,6 @@ impl Default for Deferred {
 impl Deferred {
     pub(in crate::server) fn is_empty(&self) -> bool {
         self.waiting.is_empty()
-    }
-
-    /// Whether a journal answers those that wait. It carries them out, also if the client has gone.
-    pub(in crate::server) fn is_journaled(&self) -> bool {
-        self.waiting.front().is_some_and(|first| first.is_journaled)
     }
 
     /// The bytes of requests that are not on their way yet. While there are any, others are.
@@ -158,16 +152,7 @@ impl Deferred {
                 unit_server.forward(rights, destination, &asker, unit_id, request, can_record)
             });
         let answered_by = discriminant(destination);
-        let is_journaled = matches!(destination, RequestDestination::Journal(_));
-        let (times, is_newest) = (1, true);
-        self.waiting.push_back(Waiting {
-            asked,
-            reply,
-            times,
-            is_newest,
-            answered_by,
-            is_journaled,
-        });
+        self.waiting.push_back(Waiting { asked, reply, times: 1, is_newest: true, answered_by });
         Deferral::Later(refused)
     }
 
