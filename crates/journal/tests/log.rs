@@ -2,14 +2,12 @@
 
 mod nodes;
 
-use std::collections::HashMap;
 use std::io::{BufRead, BufReader, Write as _};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use async_nats::jetstream::stream::Info;
-use futures_util::{StreamExt, TryStreamExt};
+use futures_util::StreamExt;
 use holdfast_journal::log::{LogError, LogReader, Phase, Settings, Until};
 use holdfast_memory::{
     Access, Action, Area, Freshness, Memory, Mirrored, Operation, Outcome, Read, Refusal, Refused,
@@ -491,60 +489,6 @@ fn a_snapshot_is_also_due_by_bytes() {
     });
 }
 
-/// What a node leaves whose connection is lost, or which is killed, while it stores a snapshot.
-#[test]
-fn parts_of_a_snapshot_that_was_cut_short_are_removed() {
-    let server = Server::new();
-    let node = Node::new(&[&server], "a", |settings| settings.snapshot_steps = 20);
-    node.start();
-    let left = "$O.holdfast-log-site.C.left";
-    for _ in 0..3 {
-        publish_raw(&server, left.as_bytes(), b"NATS/1.0\r\n\r\n", b"part");
-    }
-    until("they are stored", || chunks(&server).get(left) == Some(&3));
-    until("they are removed", || {
-        node.write(0, 1).unwrap();
-        !chunks(&server).contains_key(left)
-    });
-    let other = Node::started(&[&server], "b");
-    assert_eq!(other.read(0), Ok(1), "those of the newest snapshot are not");
-}
-
-/// A node that was frozen while it stored a snapshot may go on when another one has removed parts.
-#[test]
-fn a_snapshot_without_all_its_parts_is_not_named() {
-    let server = Server::new();
-    let often = |settings: &mut Settings| settings.snapshot_steps = 20;
-    // Longer than one part.
-    let node = Node::with(memory_of(65_536), &[&server], "a", often);
-    node.start();
-    // Each part takes the place of the one before.
-    change_stream(&server, "OBJ_holdfast-log-site", |info| {
-        info.config.max_messages_per_subject = 1
-    });
-    let mut events = Vec::new();
-    until("the node says why it stores none", || {
-        node.write(0, 1).unwrap();
-        events.extend(node.log.take_events(Duration::ZERO));
-        events.iter().any(|event| {
-            event.fields.iter().any(|(_, value)| value == "parts of the snapshot were removed")
-        })
-    });
-    assert!(events.iter().all(|event| event.name != "log_snapshot_stored"), "{events:?}");
-}
-
-/// The subjects of parts of snapshots, and how many parts each has.
-fn chunks(server: &Server) -> HashMap<String, usize> {
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
-    runtime.block_on(async {
-        let client = async_nats::connect(server.url()).await.unwrap();
-        let jetstream = async_nats::jetstream::new(client);
-        let stream = jetstream.get_stream("OBJ_holdfast-log-site").await.unwrap();
-        let chunks = stream.info_with_subjects("$O.holdfast-log-site.C.>").await.unwrap();
-        chunks.try_collect().await.unwrap()
-    })
-}
-
 #[test]
 fn a_log_without_room_goes_on_behind_its_newest_snapshot() {
     let server = Server::new();
@@ -577,20 +521,15 @@ fn a_node_that_starts_says_that_the_log_has_no_room() {
 
 /// From now on, the stream has no room for further messages.
 fn fill(server: &Server) {
-    change_stream(server, "holdfast-log-site", |info| {
-        info.config.max_bytes = info.state.bytes as i64;
-    });
-}
-
-fn change_stream(server: &Server, name: &str, change: impl FnOnce(&mut Info)) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     runtime.block_on(async {
         let client = async_nats::connect(server.url()).await.unwrap();
         let jetstream = async_nats::jetstream::new(client);
-        let stream = jetstream.get_stream(name).await.unwrap();
-        let mut info = stream.cached_info().clone();
-        change(&mut info);
-        jetstream.update_stream(info.config).await.unwrap();
+        let stream = jetstream.get_stream("holdfast-log-site").await.unwrap();
+        let info = stream.cached_info();
+        let mut config = info.config.clone();
+        config.max_bytes = info.state.bytes as i64;
+        jetstream.update_stream(config).await.unwrap();
     });
 }
 

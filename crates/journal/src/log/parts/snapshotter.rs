@@ -249,25 +249,10 @@ impl Snapshotter {
         let Stage::Prepared(Prepared { encoded, snapshot, .. }) = stage else { return };
         let seen = self.known.as_ref().map(|known| (known.revision, known.pointer.clone()));
         let known = seen.as_ref().map(|(revision, _)| *revision);
-        let node = self.settings.node.clone();
         background.spawn(move |store| async move {
-            let storing = async {
-                // If this fails, the next snapshot removes them.
-                let _ = store.remove_leftovers().await;
-                match store.put(seen, &encoded, snapshot).await {
-                    Ok((revision, pointer)) => {
-                        store.tidy(&pointer).await.map(|()| (revision, pointer))
-                    }
-                    Err(error) => {
-                        // At once, if the servers can be reached: they may have no room.
-                        let _ = store.remove_leftovers().await;
-                        Err(error)
-                    }
-                }
-            };
-            let stored = tokio::select! {
-                stored = storing => stored,
-                never = store.keep_lease(&node) => match never {},
+            let stored = match store.put(seen, &encoded, snapshot).await {
+                Ok((revision, pointer)) => store.tidy(&pointer).await.map(|()| (revision, pointer)),
+                Err(error) => Err(error),
             };
             store.release().await;
             match stored {

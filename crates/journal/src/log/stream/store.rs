@@ -2,20 +2,17 @@
 //! names the newest snapshot and has the digests of all nodes.
 
 use std::collections::HashMap;
-use std::convert::Infallible;
 use std::time::Duration;
 
 use async_nats::jetstream::consumer::{AckPolicy, DeliverPolicy, pull};
 use async_nats::jetstream::context::{CreateStreamErrorKind, GetStreamErrorKind};
-use async_nats::jetstream::object_store::{
-    self, InfoErrorKind, ObjectInfo, ObjectMetadata, ObjectStore,
-};
+use async_nats::jetstream::object_store::{self, ObjectMetadata, ObjectStore};
 use async_nats::jetstream::stream::{
     Config, DiscardPolicy, Info, RetentionPolicy, StorageType, Stream,
 };
 use async_nats::jetstream::{Context, ErrorCode, kv};
 use bytes::Bytes;
-use futures_util::{StreamExt, TryStreamExt};
+use futures_util::StreamExt;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use tokio::io::AsyncReadExt;
@@ -353,18 +350,6 @@ impl Store {
         }
     }
 
-    /// Renews the lease for as long as it is awaited: storing a snapshot may take longer than the lease lasts.
-    pub(in crate::log) async fn keep_lease(&self, node: &str) -> Infallible {
-        loop {
-            tokio::time::sleep(LEASE_TTL / 3).await;
-            if let Some(leases) = &self.leases {
-                let value = Bytes::copy_from_slice(node.as_bytes());
-                // If this fails, storing the snapshot fails too, or another node takes the lease.
-                let _ = leases.put(SNAPSHOT_KEY, value).await;
-            }
-        }
-    }
-
     pub(in crate::log) async fn release(&self) {
         if let Some(leases) = &self.leases {
             // Otherwise it expires.
@@ -382,13 +367,7 @@ impl Store {
         snapshot.object = format!("{}-{}-{}", snapshot.sequence, snapshot.node, snapshot.object);
         let object = ObjectMetadata { name: snapshot.object.clone(), ..ObjectMetadata::default() };
         let mut bytes = encoded;
-        let object =
-            self.objects.put(object, &mut bytes).await.map_err(|error| error.to_string())?;
-        // Another node may have taken them for those of an upload that was cut short.
-        if self.chunks().await?.get(&self.chunks_of(&object)) != Some(&object.chunks) {
-            let _ = self.objects.delete(&snapshot.object).await;
-            return Err("parts of the snapshot were removed".to_owned());
-        }
+        self.objects.put(object, &mut bytes).await.map_err(|error| error.to_string())?;
         // The key is changed only if it is as it was seen: of two nodes, one fails.
         let (revision, previous) =
             seen.map(|(at, of)| (Some(at), Some(of.newest))).unwrap_or_default();
@@ -409,43 +388,6 @@ impl Store {
                 Err(error)
             }
         }
-    }
-
-    /// Removes the chunks of all snapshots that the key does not name: an upload that is cut short leaves them,
-    /// without an object that [`Store::tidy`] could find.
-    pub(in crate::log) async fn remove_leftovers(&self) -> Result<(), String> {
-        // Before the key is read: what is named later is not among them.
-        let mut chunks = self.chunks().await?;
-        let Some((_, pointer)) = self.pointer().await.map_err(End::reason)? else { return Ok(()) };
-        for snapshot in [Some(pointer.newest), pointer.previous].into_iter().flatten() {
-            match self.objects.info(&snapshot.object).await {
-                Ok(object) => chunks.remove(&self.chunks_of(&object)),
-                Err(error) if error.kind() == InfoErrorKind::NotFound => None,
-                Err(error) => return Err(error.to_string()),
-            };
-        }
-        let objects = self.objects_stream().await?;
-        for subject in chunks.into_keys() {
-            objects.purge().filter(subject).await.map_err(|error| error.to_string())?;
-        }
-        Ok(())
-    }
-
-    /// The subjects of all chunks of objects, and how many chunks each has.
-    async fn chunks(&self) -> Result<HashMap<String, usize>, String> {
-        let all = format!("$O.{}.C.>", self.stream.cached_info().config.name);
-        let chunks = self.objects_stream().await?.info_with_subjects(all).await;
-        let chunks = chunks.map_err(|error| error.to_string())?;
-        chunks.try_collect().await.map_err(|error| error.to_string())
-    }
-
-    fn chunks_of(&self, object: &ObjectInfo) -> String {
-        format!("$O.{}.C.{}", self.stream.cached_info().config.name, object.nuid)
-    }
-
-    async fn objects_stream(&self) -> Result<Stream<()>, String> {
-        let name = format!("OBJ_{}", self.stream.cached_info().config.name);
-        self.context.get_stream_no_info(name).await.map_err(|error| error.to_string())
     }
 
     /// Removes messages and snapshots from before the snapshot before the last.
