@@ -479,6 +479,30 @@ def test_a_write_that_is_sent_again_has_the_outcome_of_the_first(
     assert found.headers.get("holdfast-maybe-written") == (None if reason is None else "true")
 
 
+def test_a_repetition_that_has_no_place_says_that_the_first_may_be_carried_out() -> None:
+    asked, go_on = threading.Semaphore(0), threading.Event()
+
+    def answer(pdu: bytes) -> bytes:
+        asked.release()
+        assert go_on.wait(wire.DEADLINE)
+        return pdu
+
+    limits = {"requests_of_device": 1}
+    with (
+        gateways.running(limits=limits) as gateway,
+        FakeDevice(answer) as device,
+        ThreadPoolExecutor(1) as threads,
+    ):
+        first = threads.submit(write_with_key, gateway.client(), device.port, "1", timeout=60_000)
+        assert asked.acquire(timeout=wire.DEADLINE)
+        for key, maybe in (("1", "true"), ("2", None)):
+            refused = write_with_key(gateway.client(), device.port, key)
+            assert refused.headers["holdfast-reason"] == "busy"
+            assert refused.headers.get("holdfast-maybe-written") == maybe
+        go_on.set()
+        assert first.result(wire.DEADLINE).status == 200
+
+
 def test_a_write_that_was_not_sent_is_carried_out_when_it_is_sent_again(gateway: Running) -> None:
     with socket.socket() as plc, ThreadPoolExecutor(1) as threads:
         plc.settimeout(wire.DEADLINE)

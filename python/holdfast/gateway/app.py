@@ -253,8 +253,18 @@ class App(Application):
 
     async def carry_out(self, request: Request, endpoint: Endpoint, given: Given) -> Response:
         """Carries out one operation on a device."""
+        is_write = endpoint.writes(given)
+        try:
+            return await self._carry_out(request, endpoint, given, is_write)
+        except BadRequest as refusal:
+            if is_write:
+                self._repeated.tell(request, refusal)
+            raise
+
+    async def _carry_out(
+        self, request: Request, endpoint: Endpoint, given: Given, is_write: bool
+    ) -> Response:
         with self._request():
-            is_write = endpoint.writes(given)
             if is_write and not self._settings.writes:
                 raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
             device = RequestedDevice(self._routes, self._pool, given, broadcast=endpoint.broadcast)

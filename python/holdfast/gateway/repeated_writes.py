@@ -36,6 +36,7 @@ KEY = Field(
     example="0b5c1f3e-4f0e-4c8e-9c55-1f6f0a6e1d10",
 )
 _HEADER = KEY.name.lower().encode()
+_MAYBE_WRITTEN = WriteOutcome("failed", True).header
 
 
 @dataclass(slots=True, eq=False)
@@ -85,6 +86,22 @@ class RepeatedWrites:
             device.maybe_sent = False
         return await self._first(name, _Write(digest), device, write)
 
+    def tell(self, request: Request, refusal: BadRequest) -> None:
+        """Says in a refusal of a repetition that the first may have been carried out.
+
+        A repetition may be refused before its key is looked up, for example as one too many.
+        """
+        try:
+            key = self._key(request)
+        except BadRequest as unusable:
+            more = unusable.headers
+        else:
+            name = (request.who, key or "")
+            is_known = name in self._pending or name in self._ended
+            more = (_MAYBE_WRITTEN,) if is_known else ()
+        present = {header for header, _ in refusal.headers}
+        refusal.headers += tuple(each for each in more if each[0] not in present)
+
     async def _first(
         self,
         name: tuple[str, str],
@@ -120,5 +137,5 @@ class RepeatedWrites:
 def _repeated(why: str) -> BadRequest:
     """Returns the refusal of a write whose outcome is unknown."""
     error = BadRequest("repeated", f"{why}: the write may have been carried out before")
-    error.headers = (WriteOutcome("failed", True).header,)
+    error.headers = (_MAYBE_WRITTEN,)
     return error

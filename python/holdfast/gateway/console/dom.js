@@ -46,7 +46,7 @@ export async function once(button, work) {
 
 /** Waits, or until `signal` is aborted. */
 export const pause = (milliseconds, signal) => new Promise((resolve) => {
-  setTimeout(resolve, milliseconds);
+  setTimeout(resolve, signal?.aborted ? 0 : milliseconds);
   signal?.addEventListener("abort", resolve);
 });
 
