@@ -664,7 +664,7 @@ def test_what_other_nodes_report_is_whole_though_it_takes_several_messages(
     count: int,
     tags: int,
 ) -> None:
-    monkeypatch.setattr(Outbox, "max_payload", most)
+    monkeypatch.setattr(Outbox, "max_answer", most)
     one, two = node("a"), node("b")
     share(one, two)
     made = [

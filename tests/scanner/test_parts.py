@@ -521,9 +521,9 @@ def test_a_message_that_the_server_does_not_take_is_dropped_and_logged_once(
 def test_an_answer_that_the_server_does_not_take_is_an_error() -> None:
     async def answered() -> list[bytes]:
         wire, outbox = Wire(), Outbox()
-        wire.max_payload = 100
+        wire.max_payload = 100 + len(batch.ANSWER_HEADER)
         outbox.connected(cast("SafeClient", wire))
-        responder = Responder("modbus", 10, outbox)
+        responder = Responder(10, outbox)
 
         async def handle(message: Msg) -> bytes:
             return b"1" * len(message.data)
@@ -534,15 +534,13 @@ def test_an_answer_that_the_server_does_not_take_is_an_error() -> None:
         await responder.finish(DEADLINE)
         return wire.sent
 
-    error = b'{"success":false,"error":"the answer is too large: 101 bytes, the server takes 100"}'
-    texts = [batch.text("r", b"1" * 100), batch.text("r", error)]
+    error = b'{"success":false,"error":"the answer is too large: 101 bytes, allowed: 100"}'
+    texts = [batch.answer("r", b"1" * 100), batch.answer("r", error)]
     assert asyncio.run(answered()) == texts
 
 
-@pytest.mark.parametrize(
-    "reply", ["modbus.shutdown", "modbus.command.d.t", "$KV.holdfast_scanner.modbus.d", "$JS.A"]
-)
-def test_a_request_is_not_answered_on_a_subject_of_scanners_or_of_nats(
+@pytest.mark.parametrize("reply", ["$KV.holdfast_scanner.modbus.d", "$JS.A"])
+def test_a_request_is_not_answered_on_a_subject_of_nats(
     caplog: pytest.LogCaptureFixture, reply: str
 ) -> None:
     """Its sender may have no right to publish to that subject."""
@@ -550,19 +548,19 @@ def test_a_request_is_not_answered_on_a_subject_of_scanners_or_of_nats(
     async def sent() -> list[bytes]:
         wire, outbox = Wire(), Outbox()
         outbox.connected(cast("SafeClient", wire))
-        responder = Responder("modbus", 10, outbox)
+        responder = Responder(10, outbox)
 
         async def handle(_: Msg) -> bytes:
             return b"1"
 
-        for subject in (reply, "modbus-hmi.inbox"):
+        for subject in (reply, "modbus.inbox"):
             message = Msg(cast("Client", wire), "modbus.browse", reply=subject)
             await responder.answering("browse", handle)(message)
         await responder.finish(DEADLINE)
         return wire.sent
 
-    assert asyncio.run(sent()) == [batch.text("modbus-hmi.inbox", b"1")]
-    reason = f"no answer to {reply}: a reply subject can't begin with modbus. or $"
+    assert asyncio.run(sent()) == [batch.answer("modbus.inbox", b"1")]
+    reason = f"no answer to {reply}: a reply subject can't begin with $"
     assert logged(caplog, "message_malformed") == [{"subject": "modbus.browse", "reason": reason}]
 
 
@@ -744,7 +742,7 @@ def test_requests_do_not_wait_for_ever_until_the_scanner_is_ready(
         async def handle(_: Msg) -> Answer:
             return Answer(success=True)
 
-        waiting = responder.Responder("modbus", 10, Answers(), asyncio.Event().wait)
+        waiting = responder.Responder(10, Answers(), asyncio.Event().wait)
         message = Msg(cast("Client", None), "modbus.browse", reply="_INBOX.1", data=b"{}")
         await waiting.answering(kind, handle)(message)
         await has_answered.wait()
@@ -766,7 +764,7 @@ def test_requests_that_wait_until_the_scanner_is_ready_stay_in_order() -> None:
                 done.set()
             return Answer(success=True)
 
-        waiting = responder.Responder("modbus", 10, cast("Outbox", None), ready.wait)
+        waiting = responder.Responder(10, cast("Outbox", None), ready.wait)
         begin = waiting.answering("command", handle)
         for name in ("first", "second", "third"):
             await begin(Msg(cast("Client", None), name))

@@ -20,7 +20,7 @@ from holdfast.scanner.settings import Settings
 from support import wire
 from support.brokers import NatsServer
 from support.certificates import Certificates
-from support.nats_bus import Caller, subscription, tag
+from support.nats_bus import Caller, logged, subscription, tag
 from support.nats_keys import ACCOUNT, Key, Operator, User, written
 from support.scanner_parts import broker_of, client_of, presence_of
 
@@ -420,14 +420,18 @@ def test_the_rights_of_the_documentation_are_enough(
     assert reasons(caplog, "nats_error") == []
 
 
+@pytest.mark.parametrize("other", ["plant.a", "plant.b"])
 def test_a_reply_subject_does_not_stop_a_scanner(
-    run_scanner: Run, caller: Caller, caplog: pytest.LogCaptureFixture
+    run_scanner: Run, caller: Caller, caplog: pytest.LogCaptureFixture, other: str
 ) -> None:
-    scanner = run_scanner(prefix="plant.a")
-    caller.publish("plant.a.browse", reply="plant.a.shutdown")
-    until_logged(caplog, "message_malformed", "no answer to plant.a.shutdown")
-    assert caller.request("plant.a.browse", b"")["success"]
-    assert scanner.serves
+    """Who sends a request may have no right to publish to its reply subject."""
+    scanners = [run_scanner(prefix=prefix) for prefix in ("plant.a", "plant.b")]
+    caller.publish("plant.a.browse", reply=f"{other}.shutdown")
+    until_logged(caplog, "message_malformed", "the answer to a request")
+    [found] = logged(caplog, "message_malformed")
+    assert found["subject"] == f"{other}.shutdown"
+    assert caller.request(f"{other}.browse", b"")["success"]
+    assert all(each.serves for each in scanners)
 
 
 def damaged(seed: str) -> str:

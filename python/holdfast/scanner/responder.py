@@ -41,14 +41,11 @@ class Responder:
 
     def __init__(
         self,
-        prefix: str,
         max_pending: int,
         outbox: Outbox,
         *until_ready: Callable[[], Awaitable[object]],
     ) -> None:
-        """`prefix` is that of the scanner's subjects. Requests wait for each of `until_ready`."""
-        self._not_answered = (f"{prefix}.", "$")
-        """How subjects begin that an answer would be a request on: to a scanner, or to NATS."""
+        """Requests wait for each of `until_ready`."""
         self._max_pending = max_pending
         self._outbox = outbox
         self._until_ready = until_ready
@@ -74,21 +71,20 @@ class Responder:
         """Answers a message that has a reply subject.
 
         Its sender has chosen that subject, and may have no right to publish to it: there is no
-        answer to a subject of scanners or of NATS.
+        answer to a subject of NATS, and scanners carry out no answers.
         """
         if not message.reply:
             return
-        if message.reply.startswith(self._not_answered):
-            refused = " or ".join(self._not_answered)
-            reason = f"no answer to {message.reply}: a reply subject can't begin with {refused}"
+        if message.reply.startswith("$"):
+            reason = f"no answer to {message.reply}: a reply subject can't begin with $"
             log_lines.refused(
                 "message_malformed", kind="reply", subject=message.subject, reason=reason
             )
             return
         payload = answer if isinstance(answer, bytes) else msgspec.json.encode(answer)
-        if len(payload) > self._outbox.max_payload:
+        if len(payload) > self._outbox.max_answer:
             # The server would end the connection, at each repetition of the request.
-            size = f"{len(payload)} bytes, the server takes {self._outbox.max_payload}"
+            size = f"{len(payload)} bytes, allowed: {self._outbox.max_answer}"
             error = Answer(success=False, error=f"the answer is too large: {size}")
             payload = msgspec.json.encode(error)
         await self._outbox.answer(message.reply, payload)

@@ -91,7 +91,7 @@ class Scanner:
             settings.exact_pauses_s or dialect.reconnect_pauses_s,
         )
         self._responder = Responder(
-            prefix, settings.limits.pending, self.outbox, self._ready.wait, self._buckets.read
+            settings.limits.pending, self.outbox, self._ready.wait, self._buckets.read
         )
         self._allowed = AllowedDevices(settings.allow, settings.device_tls, poller)
         self._devices = Devices(

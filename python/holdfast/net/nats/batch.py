@@ -33,10 +33,22 @@ _encode = msgspec.json.Encoder().encode
 LEASE = b"Holdfast-Lease"
 """The header with the revision of the lease of a device, in a fleet."""
 
+ANSWER = b"Holdfast-Answer"
+"""The header of every answer of a scanner."""
+
+ANSWER_HEADER = b"NATS/1.0\r\n%b: 1\r\n\r\n" % ANSWER
+"""The headers of an answer."""
+
 
 def text(subject: str, payload: bytes) -> bytes:
     """Returns the text that publishes one message."""
     return b"PUB %b %d\r\n%b\r\n" % (subject.encode(), len(payload), payload)
+
+
+def answer(subject: str, payload: bytes) -> bytes:
+    """Returns the text that publishes an answer."""
+    sizes = (len(ANSWER_HEADER), len(ANSWER_HEADER) + len(payload))
+    return b"HPUB %b %d %d\r\n%b%b\r\n" % (subject.encode(), *sizes, ANSWER_HEADER, payload)
 
 
 def message(subject: str, content: msgspec.Struct) -> bytes:

@@ -20,6 +20,7 @@ from nats.errors import Error
 from nats.js.errors import APIError, ServiceUnavailableError
 
 from holdfast.events import log_lines
+from holdfast.net.nats import batch
 from holdfast.net.nats.credentials import Credentials
 from holdfast.net.nats.pings import PING_INTERVAL_S, PINGS_OUTSTANDING
 from holdfast.net.nats.tolerant_client import SafeClient
@@ -235,7 +236,8 @@ class Broker:
         self, client: SafeClient, subjects: Iterable[str], queue: str = ""
     ) -> None:
         for subject in subjects:
-            made = await client.subscribe(subject, queue=queue, cb=self.handlers[subject])
+            handler = _except_answers(self.handlers[subject])
+            made = await client.subscribe(subject, queue=queue, cb=handler)
             self._subscriptions.append(made)
 
     def _note_connected(self, client: SafeClient) -> None:
@@ -273,6 +275,22 @@ class Broker:
             return
         attempts = self._backoff.failures
         log_lines.write(logging.WARNING, "nats_connect_failed", reason=reason, attempts=attempts)
+
+
+def _except_answers(handler: Handler) -> Handler:
+    """Has `handler` called for messages that are not answers of a scanner.
+
+    Who sends a request chooses the subject of its answer, and may have no right to publish there.
+    """
+
+    async def handle(message: Msg) -> None:
+        if batch.ANSWER.decode() not in (message.headers or {}):
+            await handler(message)
+            return
+        reason = "it is the answer to a request that has this reply subject"
+        log_lines.refused("message_malformed", kind="reply", subject=message.subject, reason=reason)
+
+    return handle
 
 
 def nats_reason(error: Exception) -> str:

@@ -80,6 +80,11 @@ class Outbox:
         """The size limit of messages in bytes. The server ends a connection with a larger one."""
         return USUAL_MAX_PAYLOAD_BYTES if self._client is None else self._client.max_payload
 
+    @property
+    def max_answer(self) -> int:
+        """The size limit of the payload of an answer."""
+        return self.max_payload - len(batch.ANSWER_HEADER)
+
     def put(self, messages: Collection[tuple[object, bytes]], of: object = None) -> None:
         """Adds messages `of` a device, each with a key such as its tag; a newer one replaces it.
 
@@ -100,7 +105,7 @@ class Outbox:
 
     async def answer(self, subject: str, payload: bytes) -> None:
         """Sends a message that a caller waits for, before all queued messages."""
-        client, text = self._client, batch.text(subject, payload)
+        client, text = self._client, batch.answer(subject, payload)
         if client is not None and client.is_connected:
             await batch.send(client, text, 1)
         else:

@@ -61,7 +61,7 @@ class Reports:
     @property
     def max_bytes(self) -> int:
         """The size limit of an answer."""
-        return self._outbox.max_payload
+        return self._outbox.max_answer
 
     def request(self, message: Msg, kind: type[Decoded]) -> Decoded:
         """Parses a request; an empty one is valid. Raises `Refused`."""
