@@ -346,6 +346,25 @@ def test_requests_without_end_do_not_fill_the_log(
     }
 
 
+def test_requests_that_end_nothing_do_not_hide_the_end_of_a_subscription(
+    run_scanner: Run,
+    caller: Caller,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(log_lines, "_REQUESTS", Throttle(burst=2, window=3600))
+    caplog.set_level(logging.INFO, "holdfast")
+    run_scanner()
+    assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
+    for _ in range(5):
+        assert caller.request("modbus.unsubscribe", leaving("b"))["success"]
+        assert caller.request("modbus.unsubscribe", leaving(deviceId="x", tagIds="all"))["success"]
+    assert caller.request("modbus.unsubscribe", leaving(tagIds="all"))["success"]
+    found = [vars(each)["fields"] for each in caplog.records if each.message == "unsubscribed"]
+    assert (found[-1]["device"], found[-1]["tags"]) == ("plc1", "all")
+
+
 def test_a_bad_address_in_the_middle_of_a_block_costs_its_own_tag_only(
     run_scanner: Run, caller: Caller
 ) -> None:

@@ -97,11 +97,14 @@ class RequestLog:
         fields = subscription.key.fields
         log_lines.write(logging.WARNING, "tags_not_restored", **fields, tags=shown, reason=reason)
 
-    def unsubscribed(self, request: UnsubscribeRequest) -> None:
+    def unsubscribed(self, request: UnsubscribeRequest, *, was_known: bool = True) -> None:
         """Logs the end of a subscription, or of some of its tags."""
         tags = "all" if request.ids is None else len(request.ids)
         fields = SubscriptionKey.of(request).fields
-        log_lines.requested(logging.INFO, "unsubscribed", **fields, tags=tags)
+        if was_known:
+            log_lines.requested(logging.INFO, "unsubscribed", **fields, tags=tags)
+        else:  # Apart: any number of requests that end nothing must not hide others.
+            log_lines.limited(logging.INFO, "unsubscribed", kind="unknown", **fields, tags=tags)
 
 
 @dataclass(eq=False)
@@ -168,7 +171,7 @@ class Requests:
             owner = SubscriptionKey.of(request)
             self._buckets.check_not_entry(owner)
         async with self._devices.lock(request.device_id):
-            await self._remove_stored(request)
+            was_known = await self._remove_stored(request)
         former = self.former.pop(owner, [])
         if request.ids is not None:
             ids, profiles = set(request.ids), self._rules.profiles
@@ -177,7 +180,7 @@ class Requests:
                 self.former[owner] = left
         await self._placement.settled(owner)
         self._log.adjusted(request.subscriber_id, request.device_id, adjustments)
-        self._log.unsubscribed(request)
+        self._log.unsubscribed(request, was_known=was_known or bool(former))
         return Answer(success=True)
 
     def _decoded(
@@ -187,13 +190,22 @@ class Requests:
         max_bytes = self._rules.limits.request
         return decode_lenient(data, kind, max_bytes, adjustments, normalize), adjustments
 
-    async def _remove_stored(self, request: UnsubscribeRequest) -> None:
-        """Removes tags of a subscription wherever it is stored. Raises `Refused`."""
+    async def _remove_stored(self, request: UnsubscribeRequest) -> bool:
+        """Removes tags of a subscription wherever it is stored. Raises `Refused`.
 
-        async def change() -> None:
+        Returns whether any was known.
+        """
+
+        async def change() -> bool:
+            device = self._registry.devices.get(request.device_id)
+            subscriber = None if device is None else device.subscribers.get(request.subscriber_id)
+            was_known = subscriber is not None and (
+                request.ids is None or any(id in subscriber.tags for id in request.ids)
+            )
             self._devices.remove(request)
+            return was_known
 
-        await self._placement.store(request.device_id, change)
+        return await self._placement.store(request.device_id, change)
 
     async def expire(self, subscription: SubscriptionKey) -> None:
         """Ends a subscription that was not renewed within its `ttl`."""
