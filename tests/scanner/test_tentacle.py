@@ -171,7 +171,8 @@ def test_cdab_of_a_float64_swaps_the_words_of_each_half(
         {
             "subscriber": "my-project",
             "device": "pump-skid",
-            "tag": "total",
+            "count": 1,
+            "tags": "total",
             "note": "CDAB of a float64 is read and written as CDABGHEF, as tentacle-modbus does; "
             "write CDABGHEF, or the order that you mean, with eight letters",
         }
@@ -202,6 +203,7 @@ def test_each_register_whose_bytes_are_swapped_in_writes_too_is_named(
     data = caller.listen("modbus.data.pump-skid")
     tags = [
         plc_tag("speed", 0, "int16", order="BADC"),
+        plc_tag("speed 2", 0, "int16", order="BADC"),
         plc_tag("level", 1, "uint16", order="little"),
         # Nothing of these is written in another way than before.
         plc_tag("plain", 2, "uint16", order="ABCD"),
@@ -220,9 +222,9 @@ def test_each_register_whose_bytes_are_swapped_in_writes_too_is_named(
     assert memory.read("holding_registers", 0, 2) == [0x0403, 0x0403]
 
     found = logged(caplog, "byte_order_differs")
-    assert [(each["device"], each["tag"]) for each in found] == [
-        ("pump-skid", "speed"),
-        ("pump-skid", "level"),
+    assert [(each["device"], each["count"], each["tags"]) for each in found] == [
+        ("pump-skid", 2, "speed, speed 2"),
+        ("pump-skid", 1, "level"),
     ]
     assert found[1]["note"] == (
         "DCBA swaps the bytes of the uint16 in reads and in writes; tentacle-modbus swaps them in "

@@ -71,9 +71,12 @@ def limited(level: int, event: str, *, kind: object, **fields: object) -> None:
     count(level, event, fields, kind=kind)
 
 
-def requested(level: int, event: str, **fields: object) -> None:
-    """Logs a request of a client. The limit of each event is `MAX_REQUESTS` in 10 s."""
-    count(level, event, fields, kind="request", throttle=_REQUESTS)
+def requested(level: int, event: str, **fields: object) -> bool:
+    """Logs a request of a client. The limit of each event is `MAX_REQUESTS` in 10 s.
+
+    Returns whether it was logged.
+    """
+    return count(level, event, fields, kind="request", throttle=_REQUESTS)
 
 
 def count(
@@ -85,8 +88,9 @@ def count(
     times: int = 1,
     observed: bool = True,
     throttle: Throttle | None = None,
-) -> None:
-    """Does what `limited` does for an event that occurred so many `times`.
+) -> bool:
+    """Does what `limited` does for an event that occurred so many `times`. Returns whether it was
+    logged.
 
     Observers get it if `observed`. `throttle` is the limit, in place of that of all events; see
     `own_limit`.
@@ -99,6 +103,7 @@ def count(
         write(level, event, **fields, **more)
     for observer in tuple(_OBSERVERS) if observed else ():
         observer(event, fields, by, times)
+    return admitted
 
 
 def problem(event: str, **fields: object) -> None:

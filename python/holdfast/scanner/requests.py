@@ -64,24 +64,34 @@ class RequestLog:
         for kind, found in adjustments.summary():
             if (subscriber, kind) in self._written:
                 continue
+            if not log_lines.requested(
+                logging.WARNING, kind, subscriber=subscriber, device=device, found=found
+            ):
+                continue  # Its repetition may be logged.
             if len(self._written) >= MAX_REMEMBERED:
                 # Logging an adjustment twice is harmless; memory without limit is not.
                 self._written.clear()
             self._written.add((subscriber, kind))
-            log_lines.requested(
-                logging.WARNING, kind, subscriber=subscriber, device=device, found=found
-            )
 
     def byte_orders(
         self, subscription: Subscription, adjustments: Adjustments, new: Collection[str]
     ) -> None:
         """Logs what callers must know of the tags that they had not subscribed to before."""
-        about = {"subscriber": subscription.subscriber, "device": subscription.device}
+        tags: dict[str, list[str]] = {}
         for tag, note in adjustments.byte_orders:
             if tag in new:
-                log_lines.requested(
-                    logging.WARNING, "byte_order_differs", **about, tag=tag, note=note
-                )
+                tags.setdefault(note, []).append(tag)
+        about = {"subscriber": subscription.subscriber, "device": subscription.device}
+        for note, ids in tags.items():
+            shown = clip(", ".join(ids), MAX_LOGGED_IDS)
+            log_lines.requested(
+                logging.WARNING,
+                "byte_order_differs",
+                **about,
+                count=len(ids),
+                tags=shown,
+                note=note,
+            )
 
     def subscribed(self, subscription: Subscription) -> None:
         """Logs a subscription."""
