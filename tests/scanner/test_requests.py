@@ -159,13 +159,24 @@ def test_a_request_with_anything_wrong_is_refused_and_changes_nothing(
         refused = caller.request("modbus.unsubscribe", text)
         assert (refused["success"], "internal" in refused["error"]) == (False, False)
     long = "x" * 257
-    for change in ({"deviceId": long[:129]}, {"subscriberId": long}, {"tagIds": [long]}):
+    for change in ({"deviceId": long[:129]}, {"subscriberId": long}):
         refused = caller.request("modbus.unsubscribe", leaving("known") | change)
         assert f"`str` of length <= {128 if 'deviceId' in change else 256}" in refused["error"]
     if strict:
         unknown = caller.request("modbus.unsubscribe", leaving("known", all=True))
         assert unknown == {"success": False, "error": "Object contains unknown field `all`"}
     assert _browsed(caller) == before
+
+
+@pytest.mark.parametrize("strict", [False, True])
+def test_ids_that_no_tag_can_have_are_ignored_by_an_unsubscribe(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, strict: bool
+) -> None:
+    run_scanner(strict=strict)
+    for wrong in ("", "x" * 257):
+        assert caller.request("modbus.subscribe", subscription(server, tag("a", 5)))["success"]
+        assert caller.request("modbus.unsubscribe", leaving(wrong, "a")) == {"success": True}
+        assert caller.request("modbus.browse", b"")["count"] == 0
 
 
 def _browsed(caller: Caller) -> Any:

@@ -125,9 +125,9 @@ class UnsubscribeRequest(Request):
 
     device_id: DeviceId
     subscriber_id: Id
-    tag_ids: list[Id] | Literal["all"] | None = None
-    """`all` is all tags of the subscriber. Required with dialect `tentacle`; otherwise the default
-    is `all`."""
+    tag_ids: list[str] | Literal["all"] | None = None
+    """Unknown ids are ignored. `all` is all tags of the subscriber. Required with dialect
+    `tentacle`; otherwise the default is `all`."""
 
     @property
     def ids(self) -> list[str] | None:
