@@ -856,8 +856,8 @@ def test_a_target_is_shown_as_a_url() -> None:
         ("tcp://plc/unit", "is not the address of a device"),
         (
             "tcp://plc?unit=1",
-            "unknown option 'unit', allowed: accept_unit, pad, pause.*; the unit id is not part of "
-            "the URL: set it with unit, or --unit",
+            "unknown option 'unit', allowed: accept_unit, pad, pause.*; the unit id of a device is "
+            "not part of its URL: set it with unit, or --unit",
         ),
         ("tcp://me@plc", "has a user or a fragment"),
         ("tcp://plc#1", "has a user or a fragment"),

@@ -540,6 +540,7 @@ def test_urls_of_receivers(url: str, found: Receiver) -> None:
         ("raw+tls://u@plant:9000", "allowed: raw://10.0.2.9:9000 or"),
         ("tls://plant:9000", "allowed: raw://10.0.2.9:9000 or"),
         ("raw://plant:9000?ca=a", "unknown option 'ca'"),
+        ("raw+tls://plant:9000?unit=1", "unknown option 'unit', allowed: ca, cert, key"),
         ("raw+tls://plant:9000?pause=1", "unknown option 'pause', allowed: ca, cert, key"),
         ("raw+tls://plant:9000?cert=c", "cert without key"),
         ("raw+tls://plant:9000?key_passphrase_file=c", "key_passphrase_file without key"),
@@ -549,6 +550,7 @@ def test_urls_that_name_no_receiver(url: str, wrong: str) -> None:
     with pytest.raises(ValueError, match=r"raw|tls") as raised:
         parse_receiver(url)
     assert wrong in str(raised.value)
+    assert "--unit" not in str(raised.value)
 
 
 # What is checked before anything starts

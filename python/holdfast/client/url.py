@@ -281,7 +281,7 @@ def _pop_fields(kind: type[Any], options: dict[str, Any]) -> Any:
     )
 
 
-_UNIT_HINT = "; the unit id is not part of the URL: set it with unit, or --unit"
+_UNIT_HINT = "; the unit id of a device is not part of its URL: set it with unit, or --unit"
 
 
 def options_of(url: str, scheme: str, query: str) -> dict[str, Any]:
@@ -292,7 +292,8 @@ def options_of(url: str, scheme: str, query: str) -> dict[str, Any]:
         option = OPTIONS.get(key)
         if option is None or scheme not in option.schemes:
             known = [name for name, each in OPTIONS.items() if scheme in each.schemes]
-            words = f"{listing(known)}{suggestion(key, known)}{_UNIT_HINT if key == 'unit' else ''}"
+            hint = _UNIT_HINT if key == "unit" and scheme in SCHEMES else ""
+            words = f"{listing(known)}{suggestion(key, known)}{hint}"
             raise ValueError(f"{_shown(url)}: unknown option {key!r}, allowed: {words}")
         if key in options:
             raise ValueError(f"{_shown(url)}: option {key!r} is given twice")

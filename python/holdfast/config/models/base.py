@@ -58,6 +58,7 @@ class Model(BaseModel):
 def types_of(union: object) -> tuple[str, ...]:
     """The values of `type` of the models of a union, in its order."""
     models: tuple[type[Model], ...] = get_args(union)
+    assert models, "a union of one model is the model"
     return tuple(
         word for model in models for word in get_args(model.model_fields["type"].annotation)
     )

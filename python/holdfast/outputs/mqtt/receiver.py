@@ -88,7 +88,7 @@ class BrokerReceiver(Receiver):
             self._disconnect()
             raise ConnectionError(error)
         if self._session is None:
-            assert self._stop is not None, "until comes first"
+            assert self._stop is not None, "use_stop comes first"
             self._session = self._open(self._stop)
             self._connects += 1
             self._greet(self._session)
