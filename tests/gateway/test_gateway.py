@@ -423,6 +423,7 @@ def test_a_write_that_is_sent_again_is_carried_out_once(client: web.Client) -> N
             answer = write_with_key(client, device.port, key, **more)
             assert (answer.status, answer.headers["holdfast-reason"]) == (400, "malformed")
             assert says in answer.json["error"]
+            assert "holdfast-maybe-written" not in answer.headers
         of_another_start = write_with_key(client, device.port, "00000000/1")
         assert of_another_start.status == 409
         assert of_another_start.headers["holdfast-reason"] == "repeated"
@@ -496,7 +497,7 @@ def test_a_repetition_that_has_no_place_says_that_the_first_may_be_carried_out()
         first = threads.submit(write_with_key, gateway.client(), device.port, "1", timeout=60_000)
         assert asked.acquire(timeout=wire.DEADLINE)
         for key, maybe in (("1", "true"), ("2", None)):
-            refused = write_with_key(gateway.client(), device.port, key)
+            refused = write_with_key(gateway.client(), device.port, key, timeout=60_000)
             assert refused.headers["holdfast-reason"] == "busy"
             assert refused.headers.get("holdfast-maybe-written") == maybe
         go_on.set()

@@ -72,9 +72,8 @@ class RepeatedWrites:
         key = self._key(request)
         if key is None:
             return await write()
-        name = (request.who, key)
-        digest = hashlib.sha256(b"%b\n%b" % (request.path.encode(), request.whole or b"")).digest()
-        while (known := self._pending.get(name) or self._ended.get(name)) is not None:
+        name, digest = (request.who, key), _digest(request)
+        while (known := self._known(name)) is not None:
             if known.request != digest:
                 raise malformed(f"{KEY.name} was used for another request, allowed: a new one")
             device.maybe_sent = True  # Until it is known, also for who stops waiting.
@@ -96,9 +95,9 @@ class RepeatedWrites:
         except BadRequest as unusable:
             more = unusable.headers
         else:
-            name = (request.who, key or "")
-            is_known = name in self._pending or name in self._ended
-            more = (_MAYBE_WRITTEN,) if is_known else ()
+            known = None if key is None else self._known((request.who, key))
+            is_repetition = known is not None and known.request == _digest(request)
+            more = (_MAYBE_WRITTEN,) if is_repetition else ()
         present = {header for header, _ in refusal.headers}
         refusal.headers += tuple(each for each in more if each[0] not in present)
 
@@ -122,6 +121,9 @@ class RepeatedWrites:
                 del self._ended[next(iter(self._ended))]
             this.ended.set()
 
+    def _known(self, name: tuple[str, str]) -> _Write | None:
+        return self._pending.get(name) or self._ended.get(name)
+
     def _key(self, request: Request) -> str | None:
         """Returns the key of a request. Raises `BadRequest`."""
         value = request.header(_HEADER)
@@ -132,6 +134,10 @@ class RepeatedWrites:
         if "/" in key and not key.startswith(self.prefix):
             raise _repeated(f'{KEY.name} has "/", but is not from this start of the gateway')
         return key
+
+
+def _digest(request: Request) -> bytes:
+    return hashlib.sha256(b"%b\n%b" % (request.path.encode(), request.whole or b"")).digest()
 
 
 def _repeated(why: str) -> BadRequest:

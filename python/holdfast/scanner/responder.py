@@ -40,10 +40,7 @@ class Responder:
     """Runs requests as tasks, up to a limit."""
 
     def __init__(
-        self,
-        max_pending: int,
-        outbox: Outbox,
-        *until_ready: Callable[[], Awaitable[object]],
+        self, max_pending: int, outbox: Outbox, *until_ready: Callable[[], Awaitable[object]]
     ) -> None:
         """Requests wait for each of `until_ready`."""
         self._max_pending = max_pending
