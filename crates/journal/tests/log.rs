@@ -2,12 +2,14 @@
 
 mod nodes;
 
+use std::collections::HashSet;
 use std::io::{BufRead, BufReader, Write as _};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use futures_util::StreamExt;
+use async_nats::jetstream::stream::Info;
+use futures_util::{StreamExt, TryStreamExt};
 use holdfast_journal::log::{LogError, LogReader, Phase, Settings, Until};
 use holdfast_memory::{
     Access, Action, Area, Freshness, Memory, Mirrored, Operation, Outcome, Read, Refusal, Refused,
@@ -345,7 +347,7 @@ fn a_message_that_is_sent_twice_is_applied_once() {
 fn publish_raw(server: &Server, subject: &[u8], headers: &[u8], payload: &[u8]) {
     let mut socket = std::net::TcpStream::connect(("127.0.0.1", server.port)).unwrap();
     let lengths = format!(" {} {}\r\n", headers.len(), headers.len() + payload.len());
-    let connect = b"CONNECT {\"headers\":true,\"verbose\":false}\r\nHPUB ";
+    let connect = b"CONNECT {\"headers\":true,\"verbose\":false,\"pedantic\":false}\r\nHPUB ";
     let parts = [connect, subject, lengths.as_bytes(), headers, payload, b"\r\nPING\r\n"];
     socket.write_all(&parts.concat()).unwrap();
     let mut answers = BufReader::new(socket).lines().map(Result::unwrap);
@@ -489,6 +491,72 @@ fn a_snapshot_is_also_due_by_bytes() {
     });
 }
 
+/// What a node leaves whose connection is lost, or which is killed, while it stores a snapshot.
+#[test]
+fn parts_of_a_snapshot_that_was_cut_short_are_removed() {
+    let server = Server::new();
+    let node = Node::new(&[&server], "a", |settings| settings.snapshot_steps = 20);
+    node.start();
+    let left = "$O.holdfast-log-site.C.left";
+    // Whoever sends this one may not remove the others.
+    for subject in [left, "$O.holdfast-log-site.C.*"] {
+        publish_raw(&server, subject.as_bytes(), b"NATS/1.0\r\n\r\n", b"part");
+    }
+    until("they are stored", || object_subjects(&server).contains(left));
+    until("they are removed", || {
+        node.write(0, 1).unwrap();
+        !object_subjects(&server).contains(left)
+    });
+    let snapshot = node.status().snapshot;
+    until("another snapshot is stored", || {
+        node.write(0, 1).unwrap();
+        node.status().snapshot > snapshot
+    });
+    let stored = object_subjects(&server);
+    assert_eq!(
+        stored.len(),
+        5,
+        "the parts and names of two snapshots, and what is not theirs: {stored:?}"
+    );
+    let other = Node::started(&[&server], "b");
+    assert_eq!(other.read(0), Ok(1));
+}
+
+#[test]
+fn snapshots_for_which_there_is_no_room_leave_nothing() {
+    let server = Server::new();
+    // A snapshot has several parts.
+    let often = |settings: &mut Settings| settings.snapshot_steps = 20;
+    let node = Node::with(memory_of(65_536), &[&server], "a", often);
+    node.start();
+    until("a snapshot is stored", || {
+        node.write(0, 1).unwrap();
+        node.status().snapshot.is_some_and(|sequence| sequence > 1)
+    });
+    let before = object_subjects(&server);
+    change_stream(&server, "OBJ_holdfast-log-site", |info| {
+        info.config.max_messages = info.state.messages as i64 + 1;
+    });
+    until("the next one fails", || {
+        node.write(0, 1).unwrap();
+        let events = node.log.take_events(Duration::ZERO);
+        events.iter().any(|event| event.name == "log_snapshot_failed")
+    });
+    assert_eq!(object_subjects(&server), before);
+}
+
+/// The subjects of all that the bucket of the snapshots has.
+fn object_subjects(server: &Server) -> HashSet<String> {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        let stream = jetstream.get_stream("OBJ_holdfast-log-site").await.unwrap();
+        let stored = stream.info_with_subjects("$O.>").await.unwrap();
+        stored.map_ok(|(subject, _)| subject).try_collect().await.unwrap()
+    })
+}
+
 #[test]
 fn a_log_without_room_goes_on_behind_its_newest_snapshot() {
     let server = Server::new();
@@ -521,15 +589,19 @@ fn a_node_that_starts_says_that_the_log_has_no_room() {
 
 /// From now on, the stream has no room for further messages.
 fn fill(server: &Server) {
+    change_stream(server, "holdfast-log-site", |info| {
+        info.config.max_bytes = info.state.bytes as i64;
+    });
+}
+
+fn change_stream(server: &Server, name: &str, change: impl FnOnce(&mut Info)) {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
     runtime.block_on(async {
         let client = async_nats::connect(server.url()).await.unwrap();
         let jetstream = async_nats::jetstream::new(client);
-        let stream = jetstream.get_stream("holdfast-log-site").await.unwrap();
-        let info = stream.cached_info();
-        let mut config = info.config.clone();
-        config.max_bytes = info.state.bytes as i64;
-        jetstream.update_stream(config).await.unwrap();
+        let mut info = jetstream.get_stream(name).await.unwrap().cached_info().clone();
+        change(&mut info);
+        jetstream.update_stream(info.config).await.unwrap();
     });
 }
 

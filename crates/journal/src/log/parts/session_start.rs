@@ -165,6 +165,7 @@ mod tests {
             object: String::new(),
             digest: String::new(),
             node: node.to_owned(),
+            nuid: None,
         }
     }
 

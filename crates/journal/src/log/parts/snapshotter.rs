@@ -250,10 +250,7 @@ impl Snapshotter {
         let seen = self.known.as_ref().map(|known| (known.revision, known.pointer.clone()));
         let known = seen.as_ref().map(|(revision, _)| *revision);
         background.spawn(move |store| async move {
-            let stored = match store.put(seen, &encoded, snapshot).await {
-                Ok((revision, pointer)) => store.tidy(&pointer).await.map(|()| (revision, pointer)),
-                Err(error) => Err(error),
-            };
+            let stored = store.put(seen, &encoded, snapshot).await;
             store.release().await;
             match stored {
                 Ok(named) => Report::Stored(named),

@@ -11,8 +11,9 @@ use async_nats::jetstream::stream::{
     Config, DiscardPolicy, Info, RetentionPolicy, StorageType, Stream,
 };
 use async_nats::jetstream::{Context, ErrorCode, kv};
+use base64::prelude::{BASE64_URL_SAFE, Engine};
 use bytes::Bytes;
-use futures_util::StreamExt;
+use futures_util::TryStreamExt;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 use tokio::io::AsyncReadExt;
@@ -73,6 +74,9 @@ pub(in crate::log) struct Snapshot {
     pub(in crate::log) object: String,
     pub(in crate::log) digest: String,
     pub(in crate::log) node: String,
+    /// What the subject of its parts ends with. `None`: not stored yet, or named by a version that did not say it.
+    #[serde(default)]
+    pub(in crate::log) nuid: Option<String>,
 }
 
 impl Snapshot {
@@ -85,6 +89,7 @@ impl Snapshot {
             object: format!("{:016x}", unique() as u64),
             digest,
             node: node.to_owned(),
+            nuid: None,
         }
     }
 }
@@ -357,7 +362,8 @@ impl Store {
         }
     }
 
-    /// Stores a snapshot and names it the newest, if the newest is still the one of `seen`.
+    /// Stores a snapshot and names it the newest, if the newest is still the one of `seen`. Removes all other
+    /// snapshots but the one before it, and the messages from before that one.
     pub(in crate::log) async fn put(
         &self,
         seen: Option<(u64, Pointer)>,
@@ -367,45 +373,63 @@ impl Store {
         snapshot.object = format!("{}-{}-{}", snapshot.sequence, snapshot.node, snapshot.object);
         let object = ObjectMetadata { name: snapshot.object.clone(), ..ObjectMetadata::default() };
         let mut bytes = encoded;
-        self.objects.put(object, &mut bytes).await.map_err(|error| error.to_string())?;
-        // The key is changed only if it is as it was seen: of two nodes, one fails.
+        match self.objects.put(object, &mut bytes).await {
+            Ok(object) => snapshot.nuid = Some(object.nuid),
+            Err(error) => {
+                // The servers may have no room, of which the parts that have arrived take some: they are removed. If
+                // this fails as well, the next snapshot removes them.
+                if let Some((revision, pointer)) = seen {
+                    let _ = self.name(Some(revision), &pointer).await;
+                }
+                return Err(error.to_string());
+            }
+        }
         let (revision, previous) =
             seen.map(|(at, of)| (Some(at), Some(of.newest))).unwrap_or_default();
-        let name = snapshot.object.clone();
         let pointer = Pointer { newest: snapshot, previous };
-        let value = Bytes::from(serde_json::to_vec(&pointer).map_err(|error| error.to_string())?);
-        let named = match revision {
+        let revision = self.name(revision, &pointer).await?;
+        // The last snapshot may turn out to be damaged: the one before it can still be continued.
+        if let Some(previous) = &pointer.previous
+            && previous.sequence > 1
+        {
+            let purge = self.stream.purge().sequence(previous.sequence);
+            purge.await.map_err(|error| error.to_string())?;
+        }
+        Ok((revision, pointer))
+    }
+
+    /// Names the snapshots in the key, if the key is still of this revision, and removes all others and their
+    /// parts. Returns the new revision.
+    async fn name(&self, seen: Option<u64>, pointer: &Pointer) -> Result<u64, String> {
+        let bucket = &self.stream.cached_info().config.name;
+        let objects = self.context.get_stream_no_info(format!("OBJ_{bucket}")).await;
+        let objects = objects.map_err(|error| error.to_string())?;
+        // Before the key changes: a node that has stored one of these, and not named it by then, can't name it any
+        // more, as its own change of the key expects the former revision.
+        let stored = objects.info_with_subjects(format!("$O.{bucket}.>")).await;
+        let stored = stored.map_err(|error| error.to_string())?.try_collect::<Vec<_>>().await;
+        let stored = stored.map_err(|error| error.to_string())?;
+        let value = Bytes::from(serde_json::to_vec(pointer).map_err(|error| error.to_string())?);
+        let revision = match seen {
             None => self.keys.create(SNAPSHOT_KEY, value).await.map_err(|error| error.to_string()),
             Some(at) => {
                 self.keys.update(SNAPSHOT_KEY, value, at).await.map_err(|error| error.to_string())
             }
-        };
-        match named {
-            Ok(revision) => Ok((revision, pointer)),
-            Err(error) => {
-                // If this fails as well, the next snapshot removes it.
-                let _ = self.objects.delete(&name).await;
-                Err(error)
+        }?;
+        let mut named = Vec::new();
+        for snapshot in [Some(&pointer.newest), pointer.previous.as_ref()].into_iter().flatten() {
+            // A version that did not say it has named this one: its parts can't be told from others.
+            let Some(nuid) = &snapshot.nuid else { return Ok(revision) };
+            named.push(format!("$O.{bucket}.C.{nuid}"));
+            named.push(format!("$O.{bucket}.M.{}", BASE64_URL_SAFE.encode(&snapshot.object)));
+        }
+        for (subject, _) in stored {
+            // Those of somebody else may have wildcards.
+            if !named.contains(&subject) && !subject.contains(['*', '>']) {
+                objects.purge().filter(subject).await.map_err(|error| error.to_string())?;
             }
         }
-    }
-
-    /// Removes messages and snapshots from before the snapshot before the last.
-    pub(in crate::log) async fn tidy(&self, pointer: &Pointer) -> Result<(), String> {
-        let Some(previous) = &pointer.previous else { return Ok(()) };
-        // The last snapshot may turn out to be damaged: the one before it can still be continued.
-        if previous.sequence > 1 {
-            let purge = self.stream.purge().sequence(previous.sequence);
-            purge.await.map_err(|error| error.to_string())?;
-        }
-        let mut objects = self.objects.list().await.map_err(|error| error.to_string())?;
-        while let Some(object) = objects.next().await {
-            let name = object.map_err(|error| error.to_string())?.name;
-            if name != pointer.newest.object && name != previous.object {
-                self.objects.delete(&name).await.map_err(|error| error.to_string())?;
-            }
-        }
-        Ok(())
+        Ok(revision)
     }
 }
 
