@@ -485,6 +485,7 @@ fn a_snapshot_is_also_due_by_bytes() {
     let server = Server::new();
     let node = Node::new(&[&server], "a", |settings| settings.snapshot_bytes = 5000);
     node.start();
+    assert!(node.status().snapshot.is_some(), "the one with which the log begins");
     until("two snapshots are taken", || {
         node.write(0, 1).unwrap();
         first_sequence(&server) > 1

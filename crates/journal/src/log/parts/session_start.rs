@@ -100,7 +100,7 @@ async fn create_first(node: &mut Node, store: &Store) -> Result<(), End> {
     let snapshot = Snapshot::of(state, digest_of(&encoded), &node.settings.node);
     let first = node.run_with_expiry(store.put(None, &encoded, snapshot)).await?;
     let (revision, pointer) = first.map_err(|error| End::lost("the first snapshot", error))?;
-    node.snapshotter.created(revision, pointer);
+    node.snapshotter.learn(revision, pointer);
     Ok(())
 }
 

@@ -107,12 +107,7 @@ impl Snapshotter {
         self.known.as_ref().map(|known| &known.pointer)
     }
 
-    /// This node has made the first snapshot of the log.
-    pub(in crate::log) fn created(&mut self, revision: u64, pointer: Pointer) {
-        self.known = Some(Known { revision, pointer, since: Instant::now() });
-    }
-
-    /// The key that names the snapshots was read.
+    /// The key that names the snapshots was read, or changed by this node.
     pub(in crate::log) fn learn(&mut self, revision: u64, pointer: Pointer) {
         if self.known.as_ref().is_none_or(|known| known.revision < revision) {
             let sequence = pointer.newest.sequence;
