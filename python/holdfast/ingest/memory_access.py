@@ -88,14 +88,15 @@ class Written(NamedTuple):
 class Begun:
     """Commands that have been checked."""
 
-    batch: Sequence[Mapping[str, Any]]
+    commands: Sequence[Mapping[str, Any]]
     single: bool
-    """Whether the batch is one command, sent alone."""
+    """Whether it is one command, sent alone."""
     grant: Grant
     peer: str
     stale: str | None = None
     """Why the commands may be old; `None` if nothing says so."""
-    writes: _core.Batch | None = None
+    native_batch: _core.Batch | None = None
+    """The same commands, to write them."""
     device: str | None = None
     """The device that takes the write, in place of a memory."""
     recording: Recording | None = None
@@ -105,7 +106,7 @@ class Begun:
         """The target of the only command; empty for a batch."""
         if not self.single:
             return {}
-        [command] = self.batch
+        [command] = self.commands
         return place_of(None, command["memory"], command["area"], command["address"])
 
 
@@ -164,13 +165,13 @@ class MemoryAccess:
 
     def finish(self, begun: Begun) -> Written:
         """Carries out what has begun, and waits for a device, a disk or a log. Raises `Refused`."""
-        with self.refusing(begun):
-            if begun.device is None:
-                values = self._stored(begun)
-            if begun.device is None:
+        with self.reporting_refusals(begun):
+            values = self._store(begun) if begun.device is None else None
+            if values is not None:
                 return self._accepted(begun, values)
+            # Memory is a mirror there: the device takes the write.
             code = self._to_device(begun, lambda passage, *write: passage.write(*write))
-            return self.answered(begun, code)
+            return self.finish_device_write(begun, code)
 
     async def finish_async(self, begun: Begun) -> Written | None:
         """As `finish`, for memories that a file or a log stores, without blocking a thread.
@@ -180,28 +181,28 @@ class MemoryAccess:
         """
         import asyncio  # An appliance without REST has no event loop.
 
-        assert begun.writes is not None
+        assert begun.native_batch is not None
         loop = asyncio.get_running_loop()
         ended: asyncio.Future[_Outcome] = loop.create_future()
-        begun.writes.submit(partial(_set_outcome, loop, ended))
-        with self.refusing(begun):
+        begun.native_batch.submit(partial(_set_outcome, loop, ended))
+        with self.reporting_refusals(begun):
             try:
                 outcome = await ended
             except asyncio.CancelledError:
                 # The record of the write must say what is known of it.
-                with contextlib.suppress(Refused), self.refusing(begun):
+                with contextlib.suppress(Refused), self.reporting_refusals(begun):
                     outcome = _not_confirmed() if ended.cancelled() else ended.result()
-                    self._kept(begun, outcome)
+                    self._record_outcome(begun, outcome)
                 raise
-            values = self._kept(begun, outcome)
-            return None if begun.device is not None else self._accepted(begun, values)
+            values = self._record_outcome(begun, outcome)
+            return None if values is None else self._accepted(begun, values)
 
-    def waits(self, begun: Begun) -> bool:
+    def may_block(self, begun: Begun) -> bool:
         """Whether a write to memory can take as long as a disk or a log needs to answer."""
-        return any(self.memories[command["memory"]].waits for command in begun.batch)
+        return any(self.memories[command["memory"]].waits for command in begun.commands)
 
     @contextlib.contextmanager
-    def refusing(self, begun: Begun) -> Iterator[None]:
+    def reporting_refusals(self, begun: Begun) -> Iterator[None]:
         """Counts, logs and audits a `Refused` of what has begun."""
         try:
             yield
@@ -214,13 +215,13 @@ class MemoryAccess:
         ticket: int = self._to_device(begun, lambda passage, *write: passage.call(caller, *write))
         return ticket
 
-    def answered(self, begun: Begun, code: int | None) -> Written:
+    def finish_device_write(self, begun: Begun, code: int | None) -> Written:
         """Takes the answer of the device: the code of its exception, if any. Raises `Refused`."""
         assert begun.device is not None
         if begun.recording is not None:
             begun.recording.answered_by_device(begun.device, code)
         if code is None:
-            return self._accepted(begun, len(values_of(begun.batch[0])))
+            return self._accepted(begun, len(values_of(begun.commands[0])))
         name = EXCEPTIONS.get(code, "unknown")
         detail = f"{begun.device} did not take the write: exception {code:02X} ({name})"
         if code not in NOT_EXECUTED:
@@ -381,20 +382,20 @@ class MemoryAccess:
 
     def _begun(self, document: object, grant: Grant, peer: str, stale: str | None) -> Begun:
         single = not isinstance(document, list)
-        batch: Any = [document] if single else document
-        if not batch:
+        commands: Any = [document] if single else document
+        if not commands:
             raise Refused("malformed", "the batch is empty")
-        begun = Begun(batch, single, grant, peer, stale)
+        begun = Begun(commands, single, grant, peer, stale)
         try:
             # Commands are checked one by one: native code stops at the first refused command.
-            begun.writes = _core.Batch(
+            begun.native_batch = _core.Batch(
                 self._checked(command, grant, None if single else index)  # type: ignore[misc]
-                for index, command in enumerate(batch)
+                for index, command in enumerate(commands)
             )
             if self._audit is not None:
-                origin, memories = self._origin(grant, peer), [each["memory"] for each in batch]
-                begun.recording = Recording(self._audit, origin, memories, begun.writes)
-            begun.writes.check()
+                origin, memories = self._origin(grant, peer), [each["memory"] for each in commands]
+                begun.recording = Recording(self._audit, origin, memories, begun.native_batch)
+            begun.native_batch.check()
             if begun.recording is not None:
                 begun.recording.checked()
         except Unrecorded:
@@ -407,26 +408,28 @@ class MemoryAccess:
         with self._lock:
             self._counts.accepted += 1
             self._counts.values += values
-        return Written(len(begun.batch), values, begun.batch[0]["memory"] if begun.single else None)
+        return Written(
+            len(begun.commands), values, begun.commands[0]["memory"] if begun.single else None
+        )
 
-    def _stored(self, begun: Begun) -> int:
-        """Writes to memory. Returns the number of values: 0 if a device must take them."""
-        assert begun.writes is not None
+    def _store(self, begun: Begun) -> int | None:
+        """Writes to memory. Returns the number of values; `None` if a device must take them."""
+        assert begun.native_batch is not None
         try:
             if begun.recording is not None:
                 begun.recording.before_write()
-            outcome: _Outcome = begun.writes.write()
+            outcome: _Outcome = begun.native_batch.write()
         except Unrecorded:
             raise unrecorded(begun.where) from None
         except _core.BatchRefused as refused:
             outcome = refused
-        return self._kept(begun, outcome)
+        return self._record_outcome(begun, outcome)
 
-    def _kept(self, begun: Begun, outcome: _Outcome) -> int:
-        """Records the outcome of a write. Returns as `_stored`."""
+    def _record_outcome(self, begun: Begun, outcome: _Outcome) -> int | None:
+        """Records the outcome of a write to memory. Returns as `_store`."""
         if isinstance(outcome, _core.BatchRefused):
             begun.device = self._device(begun, outcome)
-            return 0
+            return None
         values, sequence = outcome
         if begun.recording is not None:
             begun.recording.carried_out(sequence)
@@ -438,7 +441,7 @@ class MemoryAccess:
         Raises `Refused` if there is none, for a write that is granted only while the memory is
         sealed, and for one that may be old: no stale command moves a machine.
         """
-        command = begun.batch[refused.command]
+        command = begun.commands[refused.command]
         if begun.single and refused.reason == "mirrored":
             passage = self._passages.get(command["memory"])
             count = len(values_of(command))
@@ -461,7 +464,7 @@ class MemoryAccess:
 
     def _to_device(self, begun: Begun, write: Callable[..., Any]) -> Any:
         """Calls `write` with the passage, area, address and values. Raises `Refused`."""
-        [command] = begun.batch
+        [command] = begun.commands
         values = [int(value) for value in values_of(command)]
         if self._audit is not None:
             try:

@@ -131,7 +131,7 @@ class App(Application):
         begun = access.begin(body, grant, request.peer)
         if begun.device is not None:
             return _written(self._device_writes.carry_out(request, begun))
-        if access.waits(begun):
+        if access.may_block(begun):
             return _written(self._finish_async(request, begun))
         return lambda: response(JSON, _answer(access.finish(begun)))
 

@@ -48,13 +48,15 @@ class DeviceWrites:
         """Carries out a write that goes to a device. Raises `Refused`."""
         device = begun.device
         assert device is not None
-        with self._memory_access.refusing(begun):
+        with self._memory_access.reporting_refusals(begun):
             if self._waiting[device] >= MAX_WAITING:
                 detail = f"{MAX_WAITING} writes wait for {device}, which is the limit"
                 raise Refused("busy", detail, **begun.where)
             self._waiting[device] += 1
             try:
-                return self._memory_access.answered(begun, await self._answer(request, begun))
+                return self._memory_access.finish_device_write(
+                    begun, await self._answer(request, begun)
+                )
             finally:
                 self._waiting[device] -= 1
                 self._close_after_last()
@@ -75,10 +77,10 @@ class DeviceWrites:
             sent, result = await answer
         except asyncio.CancelledError:
             # Nobody waits for the answer any more: the record of the write must say so.
-            with contextlib.suppress(Refused), self._memory_access.refusing(begun):
+            with contextlib.suppress(Refused), self._memory_access.reporting_refusals(begun):
                 if not calls.give_up(ticket, answer):
                     raise _withdrawn(begun) from None
-                self._memory_access.answered(begun, TARGET_SILENT)
+                self._memory_access.finish_device_write(begun, TARGET_SILENT)
             raise
         finally:
             request.when_gone(None)
