@@ -961,6 +961,7 @@ ERRORS = [
     holdfast.RequestTimeout("no reply", maybe_sent=False),
     holdfast.InvalidResponse("an invalid length", "length"),
     polling.WriteFailed("meter", "power", 3),
+    polling.WriteFailed("meter", "power", 3, "the poller was closed"),
     TooManyValues(200, 123),
     Refused("power", "power: too large"),
     adapters.Refused("empty", "values are empty", command=1),

@@ -53,14 +53,16 @@ ABANDON_CHECK_S = 1.0
 class WriteFailed(Exception):
     """A write that a device did not confirm. It may have carried it out all the same."""
 
-    def __init__(self, device: str, tag: str, fault: int) -> None:
-        super().__init__(device, tag, fault)
+    def __init__(self, device: str, tag: str, fault: int, reason: str | None = None) -> None:
+        """`reason`: the fault as text, where that of its code would mislead."""
+        super().__init__(device, tag, fault, reason)
         self.device, self.tag = device, tag
         self.fault = fault
         """The code, see `holdfast.polling.faults`."""
 
     def __str__(self) -> str:
-        return f"{self.device}.{self.tag}: {fault_text(self.fault)}"
+        reason = self.args[3] or fault_text(self.fault)
+        return f"{self.device}.{self.tag}: {reason}"
 
 
 class Poller:
@@ -229,8 +231,8 @@ class Poller:
             number = self._poller.write(core_name, request, writing)
             while True:
                 results = writing.take(SIGNAL_CHECK_S)
-                if results is None:  # The poller was closed meanwhile.
-                    raise WriteFailed(name, tag, LOST)
+                if results is None:
+                    raise WriteFailed(name, tag, LOST, "the poller was closed during the write")
                 for done, fault in results[1]:
                     if done == number and fault:
                         raise WriteFailed(name, tag, fault)

@@ -3,5 +3,5 @@
 from __future__ import annotations
 
 WRITE_TTL_S = 10.0
-"""Seconds that a write may wait for its device, but for one timeout of that. Later, nobody expects
-it any more."""
+"""Seconds that a write may wait to be sent; one timeout of its device is added. Later, nobody
+expects it any more."""

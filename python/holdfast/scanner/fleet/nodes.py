@@ -56,7 +56,7 @@ class Command(msgspec.Struct, kw_only=True):
     epoch: int
     """The revision of the lease that the sender knows. A node with an older one must not write."""
     within: float = 0.0
-    """Seconds that it may wait for the device, besides one timeout of the device."""
+    """Seconds that it may wait to be sent to the device; one timeout of the device is added."""
 
 
 class Executed(Answer, forbid_unknown_fields=True, kw_only=True):
