@@ -74,7 +74,7 @@ def made(id: str, address: int = 0, type: str = "uint16") -> Tag:
 
 def device(**subscribers: tuple[int, Publish, float, str]) -> ScannedDevice:
     """A device whose subscribers have rate, mode, deadband, and tags of one letter."""
-    found = ScannedDevice("plc", Source(TARGET, 1, 1000, False, Plan()), TARGET, Health(), ("plc",))
+    found = ScannedDevice("plc", Source(TARGET, 1, 1000, False, Plan()), TARGET, Health())
     for name, (rate, publish, deadband, ids) in subscribers.items():
         found.subscribers[name] = Subscriber(
             rate, publish, deadband, dict.fromkeys(ids, TagOptions(False, None))

@@ -68,6 +68,15 @@ class Tentacle:
         """Returns the subject of a tag's values. All tags of a device share it."""
         return f"{prefix}.data.{subject_id(device)}"
 
+    def second_data_subject(self, prefix: str, device: str, /) -> str | None:
+        """Returns the subject under which all values of a device are published again, if any."""
+        name = second_id(device)
+        return None if name is None else f"{prefix}.data.{name}"
+
+    def status_subjects(self, prefix: str, device: str) -> tuple[str, ...]:
+        """Returns the subjects under each of which the state of a device is published."""
+        return tuple(f"{prefix}.status.{name}" for name in self.device_names(device))
+
     def check_unsubscribe(self, request: UnsubscribeRequest) -> None:
         """Raises `Refused` for a request that may have lost its tags, and would end everything."""
         if request.tag_ids is None:

@@ -91,6 +91,14 @@ class TentacleNext:
         """Returns the subject that a tag has alone."""
         return f"{prefix}.data.{tentacle_next_name(device)}.{tentacle_next_name(tag)}"
 
+    def second_data_subject(self, _prefix: str, _device: str, /) -> None:
+        """Returns nothing: values are published once."""
+        return
+
+    def status_subjects(self, prefix: str, device: str) -> tuple[str, ...]:
+        """Returns the only subject."""
+        return (f"{prefix}.status.{tentacle_next_name(device)}",)
+
     def check_unsubscribe(self, request: UnsubscribeRequest) -> None:
         """Allows all: without tags, the whole subscription is meant."""
 

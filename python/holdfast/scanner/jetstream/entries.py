@@ -39,16 +39,26 @@ _PLAIN = re.compile(r"[A-Za-z0-9_-]+")
 _encode = msgspec.json.Encoder().encode
 
 
+def subscription_keys(prefix: str) -> str:
+    """Returns what the keys of all requests begin with, see `numbered`."""
+    return f"{prefix}.subscription."
+
+
+def status_keys(prefix: str) -> str:
+    """Returns what the keys of the states of all devices begin with."""
+    return f"{prefix}.status."
+
+
 def status_key(prefix: str, device: str) -> str:
-    """Returns the key of a device's status, which is also the subject of its messages."""
-    return f"{prefix}.status.{subject_id(device)}"
+    """Returns the key of the state of a device."""
+    return status_keys(prefix) + subject_id(device)
 
 
 def numbered(
     prefix: str, device: str, subscriber: str, values: Iterable[bytes]
 ) -> dict[str, bytes]:
     """Returns the requests of a subscriber for a device by their keys."""
-    keys = f"{prefix}.subscription.{_token(subscriber)}.{subject_id(device)}"
+    keys = f"{subscription_keys(prefix)}{_token(subscriber)}.{subject_id(device)}"
     return {f"{keys}.{number}": value for number, value in enumerate(values)}
 
 

@@ -25,6 +25,7 @@ from holdfast.scanner.jetstream.entries import (
     resized,
     restored,
     status_key,
+    status_keys,
     tag_ids,
     with_later,
     with_profile,
@@ -247,7 +248,7 @@ class StoredSubscriptions(Placement):
         found: dict[SubscriptionKey, list[SubscribeRequest]] = {}
         for key, value in sorted(entries, key=lambda entry: number(entry[0])):
             try:
-                if key.startswith(f"{self._prefix}.status."):
+                if key.startswith(status_keys(self._prefix)):
                     owners[key] = SubscriptionKey(msgspec.json.decode(value, type=Status).device_id)
                     continue
                 request = restored(value)

@@ -26,6 +26,7 @@ from holdfast.scanner.jetstream.availability import (
     Availability,
     State,
 )
+from holdfast.scanner.jetstream.entries import status_keys, subscription_keys
 from holdfast.scanner.jetstream.key_watch import reading
 
 if TYPE_CHECKING:
@@ -176,8 +177,8 @@ class EntryStore:
         except NotFoundError:
             bucket = await jetstream.create_key_value(bucket=BUCKET, history=1)
         entries = []
-        for kind in ("subscription.*.*.*", "status.*"):
-            async with reading(jetstream, BUCKET, f"{self._prefix}.{kind}") as reader:
+        for keys in (f"{subscription_keys(self._prefix)}*.*.*", f"{status_keys(self._prefix)}*"):
+            async with reading(jetstream, BUCKET, keys) as reader:
                 found = await reader.fetch_all()
             entries += [(key, each.value) for key, each in found.items() if each is not None]
         owners = self._on_read(entries)
@@ -281,5 +282,5 @@ class EntryStore:
             jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
             async with self._busy:  # What is on its way to the server comes before the removal.
                 await jetstream.purge_stream(
-                    STREAM, subject=f"{KEY_SUBJECTS}{self._prefix}.status.*"
+                    STREAM, subject=f"{KEY_SUBJECTS}{status_keys(self._prefix)}*"
                 )

@@ -4,8 +4,10 @@ A device id may have blanks and dots, a part of a subject may not. Callers of te
 replace only the characters that NATS does not allow, and subscribe to the subject with that name
 (`second_id`). If the two names differ, the data is published under both.
 
-Programs of tentacle-next replace other characters, and listen to one subject for each tag. Whole
-subjects are made by `data_subject` of each dialect.
+Programs of tentacle-next replace other characters, and listen to one subject for each tag.
+
+Whole subjects of values and states are made by each dialect, and keys of buckets by
+`jetstream.entries`: nothing else joins these parts.
 """
 
 from __future__ import annotations

@@ -119,8 +119,9 @@ class NatsOutput(Receiver):
             if as_quoted(subject) in forbidden:
                 refused.update((subject, at) for at in which)
         for subject, at in refused:
-            if subject.startswith(f"{self._prefix}.status."):
-                self._states.pop(readings[at].device, None)  # It is published again.
+            device = readings[at].device
+            if subject in self._dialect.status_subjects(self._prefix, device):
+                self._states.pop(device, None)  # It is published again.
         if reasons:
             raise Refused(reasons[0], [readings[at] for at in sorted({at for _, at in refused})])
 
@@ -206,7 +207,5 @@ class NatsOutput(Receiver):
             return []
         self._states[device] = message.state
         payload = _encode(message)
-        return [
-            (f"{self._prefix}.status.{name}", payload)
-            for name in self._dialect.device_names(device)
-        ]
+        subjects = self._dialect.status_subjects(self._prefix, device)
+        return [(subject, payload) for subject in subjects]

@@ -56,6 +56,8 @@ class Publisher:
         self._prefix = prefix
         self._device = device
         self._dialect = dialect
+        self.second_subject = dialect.second_data_subject(prefix, device)
+        """The subject under which all messages are published again, if any."""
         self._new_groups: Callable[[], Sequence[Group]] | None = None
         """Returns the groups from the next poll on; `None` if they have not changed."""
         self._new_tags: set[str] = set()

@@ -13,7 +13,7 @@ from holdfast.scanner.publish.publisher import Publisher
 from holdfast.scanner.subscriptions.groups import grouped
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Collection
 
     from holdfast.net.nats.outbox import Outbox
     from holdfast.scanner.dialects import Dialect
@@ -65,10 +65,10 @@ class Publishers:
     def publish_values(self, device: ScannedDevice, due: float, blocks: list[PolledBlock]) -> None:
         """Publishes the results of a poll that are due."""
         id = device.id
-        messages = self._publishers[id].messages(due, blocks)
+        publisher = self._publishers[id]
+        messages = publisher.messages(due, blocks)
         self._outbox.put(messages, of=id)
-        if len(device.subjects) > 1:
-            other = f"{self._prefix}.data.{device.subjects[1]}"
+        if (other := publisher.second_subject) is not None:
             again = [(tag, batch.readdressed(text, other)) for tag, text in messages]
             self._outbox.put(again, of=(id, other))
 
@@ -88,19 +88,15 @@ class Publishers:
         device.status = msgspec.json.encode(status)
         self._placement.state_changed(device.id)
         lease = self._placement.lease(device)
-        self._put_status(device.id, device.subjects, device.status, lease)
+        self._put_status(device.id, device.status, lease)
 
     def publish_given_up(self, device_id: str, reason: str) -> None:
         """Publishes that a device is offline that is not known any more."""
         status = Status(device_id, "offline", 0, int(time.time() * 1000), reason)
-        names = self._dialect.device_names(device_id)
-        self._put_status(device_id, names, msgspec.json.encode(status))
+        self._put_status(device_id, msgspec.json.encode(status))
 
-    def _put_status(
-        self, device_id: str, names: Iterable[str], status: bytes, lease: int | None = None
-    ) -> None:
-        for name in names:
-            subject = f"{self._prefix}.status.{name}"
+    def _put_status(self, device_id: str, status: bytes, lease: int | None = None) -> None:
+        for subject in self._dialect.status_subjects(self._prefix, device_id):
             text = batch.text(subject, status)
             if lease is not None:
                 text = batch.leased(text, lease)

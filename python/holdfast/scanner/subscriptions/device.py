@@ -86,8 +86,6 @@ class ScannedDevice:
     address: Target
     """The target with the resolved address."""
     health: Health
-    subjects: tuple[str, ...]
-    """The names of the device in subjects; nearly always one."""
     writes: Writes = "tags"
     """Which of its tags may be written."""
     endpoint: Endpoint | None = None

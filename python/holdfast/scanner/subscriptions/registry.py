@@ -180,15 +180,14 @@ class Registry:
     ) -> ScannedDevice:
         """Adds a device; with the subscribers and the tags of the one that it replaces, if any."""
         id = subscription.device
-        subjects = self._dialect.device_names(id)
-        device = ScannedDevice(id, source, address, Health(), subjects, self._writes)
+        device = ScannedDevice(id, source, address, Health(), self._writes)
         if former is not None:
             device.subscribers, device.tags = dict(former.subscribers), dict(former.tags)
             self._release_connection(former)
         self.devices[device.id] = device
         place = physical_connection(source.target)
         self._devices_by_connection.setdefault(place, []).append(device.id)
-        self._subjects |= dict.fromkeys(_subjects(device), device.id)
+        self._subjects |= dict.fromkeys(self._names(id), id)
         return device
 
     def unsubscribe(self, request: UnsubscribeRequest) -> tuple[ScannedDevice | None, bool]:
@@ -218,15 +217,14 @@ class Registry:
         if not device.subscribers:
             del self.devices[device.id]
             self._release_connection(device)
-            for name in _subjects(device):
+            for name in self._names(device.id):
                 del self._subjects[name]
             return device, True
         return device, bool(forgotten) or device.rate != before
 
     def has_subjects_of(self, device_id: str) -> bool:
         """Returns whether a known device has a name in subjects that this one would have."""
-        names = {subject_id(device_id), *self._dialect.device_names(device_id)}
-        return not names.isdisjoint(self._subjects)
+        return not self._names(device_id).isdisjoint(self._subjects)
 
     def named(self, name: str) -> ScannedDevice | None:
         """Returns the device with a name in subjects, if there is one."""
@@ -255,6 +253,10 @@ class Registry:
             raise Refused(f"{name!r} is ambiguous: {known}")
         [(device_id, id)] = matches
         return self.devices[device_id], self.devices[device_id].tags[id]
+
+    def _names(self, device_id: str) -> set[str]:
+        """Returns the names of a device in subjects and in stored entries."""
+        return {subject_id(device_id), *self._dialect.device_names(device_id)}
 
     def _ids(self, name: str) -> set[str]:
         """Returns the tag ids that a command may mean by a name."""
@@ -313,8 +315,3 @@ def _new_to_subscriber(device: ScannedDevice | None, subscription: Subscription)
         for id, tag in subscription.tags.items()
         if id not in subscriber.tags or device.tags[id] != tag
     }
-
-
-def _subjects(device: ScannedDevice) -> set[str]:
-    """Returns the names of a device in subjects and in stored entries."""
-    return {subject_id(device.id), *device.subjects}
