@@ -25,7 +25,7 @@ from holdfast.net.nats import batch
 from holdfast.net.nats_server import TemporaryServer
 from holdfast.scanner.publish.publisher import Publisher
 from holdfast.scanner.subscriptions.groups import Group
-from holdfast.scanner.subscriptions.tag import Tag
+from holdfast.scanner.subscriptions.tag import ScannedTag
 
 TAGS = 100
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -173,7 +173,7 @@ def show(title: str, found: Any) -> None:
 def costs() -> dict[str, float]:
     """Returns the microseconds per value that the event loop takes, measured in this process."""
     tags = tuple(
-        Tag(f"tag{at}", "holding_registers", at, "uint16", "ABCD", frozenset())
+        ScannedTag(f"tag{at}", "holding_registers", at, "uint16", "ABCD", frozenset())
         for at in range(TAGS)
     )
     data = bytes(2 * TAGS)

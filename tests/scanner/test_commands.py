@@ -10,10 +10,10 @@ import pytest
 from nats.errors import NoRespondersError
 
 from holdfast.scanner import service
-from holdfast.scanner.commands import value
+from holdfast.scanner.commands import register_value
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.subscriptions.request_rules import ScannerLimits
-from holdfast.scanner.subscriptions.tag import Tag
+from holdfast.scanner.subscriptions.tag import ScannedTag
 from support import wire
 from support.fake_device import FakeDevice, exception, registers
 from support.nats_bus import Caller, leaving, subscription, tag
@@ -370,11 +370,11 @@ def test_commands_for_one_device_are_carried_out_in_order(
 
 
 def test_a_number_is_exact() -> None:
-    def of(kind: str) -> Tag:
-        return Tag("a", "holding_registers", 0, kind, "ABCD", frozenset())
+    def of(kind: str) -> ScannedTag:
+        return ScannedTag("a", "holding_registers", 0, kind, "ABCD", frozenset())
 
-    assert value("9007199254740993", of("int64")) == 2**53 + 1
-    assert value("0.1", of("float64")) == 0.1
-    assert struct.pack(">f", value("0.1", of("float32"))) == struct.pack(">f", 0.1)
+    assert register_value("9007199254740993", of("int64")) == 2**53 + 1
+    assert register_value("0.1", of("float64")) == 0.1
+    assert struct.pack(">f", register_value("0.1", of("float32"))) == struct.pack(">f", 0.1)
     with pytest.raises(Refused):
-        value("1e999999999", of("int64"))
+        register_value("1e999999999", of("int64"))

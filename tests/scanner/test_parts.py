@@ -50,7 +50,7 @@ from holdfast.scanner.subscriptions.plan import Plan
 from holdfast.scanner.subscriptions.registry import Registry
 from holdfast.scanner.subscriptions.request_rules import Rules, ScannerLimits
 from holdfast.scanner.subscriptions.subscription import subscription_of
-from holdfast.scanner.subscriptions.tag import Tag
+from holdfast.scanner.subscriptions.tag import ScannedTag
 from holdfast.tags.decoding import Places, decoder
 from support.nats_bus import logged
 from support.wire import DEADLINE
@@ -68,8 +68,8 @@ ANSWERED = 1_700_000_000.0
 """Seconds since 1970."""
 
 
-def made(id: str, address: int = 0, type: str = "uint16") -> Tag:
-    return Tag(id, "holding_registers", address, type, "ABCD", frozenset())
+def made(id: str, address: int = 0, type: str = "uint16") -> ScannedTag:
+    return ScannedTag(id, "holding_registers", address, type, "ABCD", frozenset())
 
 
 def device(**subscribers: tuple[int, Publish, float, str]) -> ScannedDevice:
@@ -229,14 +229,14 @@ def test_thousands_of_tags_far_apart_cost_no_more_each_than_a_few(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     count = 0
-    end: Any = Tag.end
+    end: Any = ScannedTag.end
 
-    def counted(tag: Tag) -> int:
+    def counted(tag: ScannedTag) -> int:
         nonlocal count
         count += 1
         return int(end.fget(tag))
 
-    monkeypatch.setattr(Tag, "end", property(counted))
+    monkeypatch.setattr(ScannedTag, "end", property(counted))
     tags = {f"t{at}": made(f"t{at}", 12 * at) for at in range(2000)}
     plc = device()
     plc.tags = tags
@@ -268,7 +268,7 @@ def test_tags_are_found_where_a_block_has_them_whole(
     places: list[tuple[int, int]], address: int, count: int
 ) -> None:
     tags = [
-        Tag(f"{at}", area, start, f"uint16[{size}]", "ABCD", frozenset())
+        ScannedTag(f"{at}", area, start, f"uint16[{size}]", "ABCD", frozenset())
         for at, (start, size) in enumerate(places)
         for area in ("holding_registers", "input_registers")
     ]
@@ -367,7 +367,7 @@ def test_blocks_that_change_all_the_time_are_not_all_remembered() -> None:
 
 @given(st.binary(min_size=3, max_size=3))
 def test_bits_are_taken_from_their_places(data: bytes) -> None:
-    tags = [Tag(f"{at}", "coils", at, "bool", "ABCD", frozenset()) for at in range(7, 31)]
+    tags = [ScannedTag(f"{at}", "coils", at, "bool", "ABCD", frozenset()) for at in range(7, 31)]
     values = decoder(tags, 7, 24)(data)
     assert values == [bool(data[at // 8] >> at % 8 & 1) for at in range(24)]
 

@@ -69,7 +69,7 @@ def test_the_values_of_a_profile_are_scaled(
     request["tags"].append(tag("raw_flow", 4, datatype="float32"))
     assert caller.request("modbus.subscribe", request) == {"success": True, "count": 8}
     values: dict[str, Any] = {"raw": 215, "water": 21.5, "setpoint": 17.5, "mode": 1, "open": False}
-    # A tag with a meaning has the digits of its type, any other is the number in the registers.
+    # A tag of a profile has the digits of its type, any other is the number in the registers.
     values |= {"flow": 230.1, "flows": [23.01, None], "raw_flow": 230.10000610351562}
     assert first(data, 8) == values
     memory.write("holding_registers", 0, [65535])

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.responder import Responder
     from holdfast.scanner.settings import Settings
     from holdfast.scanner.subscriptions.registry import Registry
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
 
 NOT_WRITTEN_FAULTS = (*NOT_EXECUTED, NO_CONNECTION, UNREACHABLE, STANDBY, EXPIRED, WITHDRAWN)
 """Faults of a write that the device certainly has not carried out."""
@@ -50,13 +50,13 @@ NOT_WRITTEN_FAULTS = (*NOT_EXECUTED, NO_CONNECTION, UNREACHABLE, STANDBY, EXPIRE
 MOVED = f"not written: {fault_text(STANDBY)}"
 
 
-def value(text: str, tag: Tag) -> Any:
+def register_value(text: str, tag: ScannedTag) -> Any:
     """What the registers have to hold for a value, given as text. Raises `Refused`."""
     try:
-        if tag.meaning is None:
+        if tag.profile_tag is None:
             made = from_text(text, parsed(tag.type), tag.requested_type)
         else:
-            made = tag.meaning.raw(value_from(tag.meaning, text))
+            made = tag.profile_tag.raw(value_from(tag.profile_tag, text))
     except ValueError as error:
         raise Refused(str(error)) from None
     try:
@@ -120,7 +120,7 @@ class Commands:
         tag = device.tags[tag_id]
         if (flaw := unwritable(device, tag)) is not None:
             raise Refused(f"tag {tag.id!r} of {device.id} is not writable: {flaw}")
-        made = value(text, tag)
+        made = register_value(text, tag)
         try:
             [request] = write_typed(
                 tag.area, tag.address, made, tag.type, tag.order, tag.encoding, split=False

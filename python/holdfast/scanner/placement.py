@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.key import SubscriptionKey
     from holdfast.scanner.subscriptions.subscription import Subscription
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
 
 Changed = TypeVar("Changed")
 """What a change of subscriptions returns."""
@@ -242,7 +242,7 @@ class Placement:
     async def write(
         self,
         _device: ScannedDevice,
-        _tag: Tag,
+        _tag: ScannedTag,
         _text: str,
         own: Callable[[Callable[[], float]], Awaitable[None]],
         remaining_s: Callable[[], float],

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.settings import FleetSettings, Settings
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
 
 
 class FleetPlacement(FleetMember):
@@ -71,7 +71,7 @@ class FleetPlacement(FleetMember):
     async def write(
         self,
         device: ScannedDevice,
-        tag: Tag,
+        tag: ScannedTag,
         text: str,
         own: Callable[[Callable[[], float]], Awaitable[None]],
         remaining_s: Callable[[], float],

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from holdfast.scanner.messages.types import Marker
     from holdfast.scanner.subscriptions.device import ScannedDevice
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
     from holdfast.tags import TagList
 
     Profiles = Mapping[str, TagList]
@@ -279,10 +279,10 @@ def _place(device: ScannedDevice) -> dict[str, object]:
     return {"host": target.host, "port": target.port, "transport": target.transport}
 
 
-def _tag(tag: Tag, options: TagOptions, profile: str | None) -> TagRequest:
+def _tag(tag: ScannedTag, options: TagOptions, profile: str | None) -> TagRequest:
     """Returns a tag as a request; without what a subscription to its whole `profile` sets."""
-    if tag.meaning is not None and tag.profile == profile:
-        options = NO_OPTIONS if options == TagOptions.of_profile(tag.meaning) else options
+    if tag.profile_tag is not None and tag.profile == profile:
+        options = NO_OPTIONS if options == TagOptions.of_profile(tag.profile_tag) else options
     text = options.description
     return TagRequest(
         id=tag.id,

@@ -23,7 +23,7 @@ from holdfast.tags.decoding import Places, Undecoded, decoder
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence, Set
 
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
     from holdfast.tags.decoding import Decoder
     from holdfast.types import Area, PolledBlock
 
@@ -181,7 +181,7 @@ class Publisher:
         if part.needs_cleaning:
             values = [tag.value(raw) for raw, tag in zip(values, part.tags, strict=True)]
         selected = self._filtered(part, values) if part.needs_filter else repeat(True)
-        if part.has_meanings:  # What is not published does not need its digits.
+        if part.has_profile_tags:  # What is not published does not need its digits.
             values = [
                 tag.published(value) if is_published and type(value) is not Undecoded else value
                 for value, tag, is_published in zip(values, part.tags, selected, strict=False)
@@ -244,7 +244,9 @@ class Publisher:
             covered.update(part.ids)
             yield index, part
 
-    def _block_part(self, scheduled: _ScheduledGroup, tags: list[Tag], block: Place) -> _BlockPart:
+    def _block_part(
+        self, scheduled: _ScheduledGroup, tags: list[ScannedTag], block: Place
+    ) -> _BlockPart:
         _, address, count = block
         group = scheduled.group
         is_infallible = all(tag.type in _INFALLIBLE_TYPES and tag.source is None for tag in tags)
@@ -256,13 +258,14 @@ class Publisher:
             [self._template(tag) for tag in tags],
             [scheduled.deadbands[tag.id] for tag in tags],
             is_plain_json=is_infallible,
-            needs_cleaning=remembered or any(tag.null or tag.meaning is not None for tag in tags),
-            has_meanings=any(tag.meaning is not None for tag in tags),
+            needs_cleaning=remembered
+            or any(tag.null or tag.profile_tag is not None for tag in tags),
+            has_profile_tags=any(tag.profile_tag is not None for tag in tags),
             change=group.change,
             needs_filter=remembered or not is_infallible,
         )
 
-    def _template(self, tag: Tag) -> _Template:
+    def _template(self, tag: ScannedTag) -> _Template:
         message = _encode(Data(self._prefix, self._device, tag.id, None, tag.datatype, 0))
         # What follows the value has no `null`, whatever the ids have.
         before, _, rest = message.rpartition(b"null")
@@ -297,7 +300,7 @@ class _BlockPart(NamedTuple):
     """The tags of a group that are in one block."""
 
     decoder: Decoder
-    tags: Sequence[Tag]
+    tags: Sequence[ScannedTag]
     ids: Sequence[str]
     templates: Sequence[_Template]
     deadbands: Sequence[float]
@@ -305,7 +308,7 @@ class _BlockPart(NamedTuple):
     """Whether all values can be encoded as one JSON array and split at the commas."""
     needs_cleaning: bool
     """Whether some values must be converted, such as NaN or a marker to `null`."""
-    has_meanings: bool
+    has_profile_tags: bool
     """Whether some tags are from profiles."""
     change: bool
     needs_filter: bool

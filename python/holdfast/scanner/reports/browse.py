@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from holdfast.scanner.messages.types import BrowseRequest, ServiceReport
     from holdfast.scanner.subscriptions.device import ScannedDevice
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
 
 _encode = msgspec.json.Encoder().encode
 
@@ -139,7 +139,7 @@ class DeviceReporter:
             ),
         )
 
-    def _with(self, tags: Sequence[Tag]) -> DeviceReport:
+    def _with(self, tags: Sequence[ScannedTag]) -> DeviceReport:
         """Returns a report with these tags, their blocks and their subscribers."""
         ids = {tag.id for tag in tags}
         return msgspec.structs.replace(
@@ -186,7 +186,7 @@ class DeviceReporter:
                 error=fault_text(fault) if fault else None,
             )
 
-    def _reports(self, tags: Sequence[Tag]) -> Iterator[TagReport]:
+    def _reports(self, tags: Sequence[ScannedTag]) -> Iterator[TagReport]:
         errors = dict(self._device.undecoded)
         for area, address, count, _, fault, _ in self._device.health.blocks:
             if fault:
@@ -203,7 +203,7 @@ class DeviceReporter:
                 writable=unwritable(self._device, tag) is None,
                 description=self._device.description(tag.id),
                 profile=tag.profile,
-                unit="" if tag.meaning is None else tag.meaning.unit,
+                unit="" if tag.profile_tag is None else tag.profile_tag.unit,
                 error=errors.get(tag.id),
             )
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.jetstream.entry_subscriptions import RefusedEntry
     from holdfast.scanner.messages.types import Quality, VariablesRequest
     from holdfast.scanner.subscriptions.device import ScannedDevice
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
 
 _encode = msgspec.json.Encoder().encode
 
@@ -102,7 +102,7 @@ def _refused(
                 )
 
 
-def variable(device: ScannedDevice, tag: Tag, module: str) -> Variable:
+def variable(device: ScannedDevice, tag: ScannedTag, module: str) -> Variable:
     """Returns the latest value of a tag."""
     latest = device.latest.value(tag)
     quality: Quality = "good"
@@ -123,7 +123,7 @@ def variable(device: ScannedDevice, tag: Tag, module: str) -> Variable:
     )
 
 
-def _read(device: ScannedDevice, tag: Tag) -> bool:
+def _read(device: ScannedDevice, tag: ScannedTag) -> bool:
     """Returns whether the last scan read a tag, without a fault."""
     span = tag.span
     faults = [

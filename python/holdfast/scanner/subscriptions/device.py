@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.messages.types import SubscribeRequest
     from holdfast.scanner.subscriptions.health import Health
     from holdfast.scanner.subscriptions.plan import Plan
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
 
 LOOKUP_INTERVAL_S = 10.0
 """Time between lookups of the name of a device that does not respond."""
@@ -91,7 +91,7 @@ class ScannedDevice:
     endpoint: Endpoint | None = None
     """The native form of `address`, for the poller."""
     subscribers: dict[str, Subscriber] = field(default_factory=dict)
-    tags: dict[str, Tag] = field(default_factory=dict)
+    tags: dict[str, ScannedTag] = field(default_factory=dict)
     """The tags of all subscribers, by id."""
     latest: LatestBlocks = field(default_factory=LatestBlocks)
     undecoded: dict[str, str] = field(default_factory=dict)

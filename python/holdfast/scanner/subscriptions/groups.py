@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from holdfast.scanner.subscriptions.device import ScannedDevice
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Group:
     """Milliseconds."""
     change: bool
     """Whether only changes greater than the deadbands are published."""
-    tags: tuple[Tag, ...]
+    tags: tuple[ScannedTag, ...]
     deadbands: tuple[float, ...]
 
 

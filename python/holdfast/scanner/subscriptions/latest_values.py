@@ -13,7 +13,7 @@ from holdfast.tags.decoding import Undecoded, value_of
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
     from holdfast.types import Area, PolledBlock
 
 MAX_BLOCKS = 4096
@@ -50,7 +50,7 @@ class LatestBlocks:
         for place in without_overlap(self._blocks, blocks):
             del self._blocks[place]
 
-    def value(self, tag: Tag) -> Latest | None:
+    def value(self, tag: ScannedTag) -> Latest | None:
         """Returns the latest value of a tag; `None` if it was never read.
 
         A value that can't be decoded is `None`.

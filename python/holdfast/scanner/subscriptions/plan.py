@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from holdfast.scanner.messages.types import PlanRequest, Range
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
     from holdfast.types import Area
 
 
@@ -46,7 +46,7 @@ class Plan:
             request,
         )
 
-    def blocks(self, tags: Sequence[Tag]) -> list[tuple[Area, int, int, list[int], int]]:
+    def blocks(self, tags: Sequence[ScannedTag]) -> list[tuple[Area, int, int, list[int], int]]:
         """Returns the blocks that read the tags, see `plan_blocks`. Raises `ValueError`."""
         return plan_blocks(
             [(tag.area, tag.span.start, len(tag.span)) for tag in tags],
@@ -57,7 +57,7 @@ class Plan:
             forbidden=self.forbidden,
         )
 
-    def check(self, tags: Sequence[Tag]) -> None:
+    def check(self, tags: Sequence[ScannedTag]) -> None:
         """Raises `Refused` for a tag that the plan does not allow to read."""
         for tag in tags:
             most = self.max_bits if tag.of_bits else self.max_registers

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.messages.types import UnsubscribeRequest
     from holdfast.scanner.subscriptions.request_rules import ScannerLimits
     from holdfast.scanner.subscriptions.subscription import Subscription
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,8 @@ class Registry:
         for tag in map(self._shared_tag, subscription.tags.values()):
             device.tags[tag.id] = tag
             options = subscription.options[tag.id]
-            if options is NO_OPTIONS and tag.meaning and tag.profile == subscriber.profile:
-                options = TagOptions.of_profile(tag.meaning)
+            if options is NO_OPTIONS and tag.profile_tag and tag.profile == subscriber.profile:
+                options = TagOptions.of_profile(tag.profile_tag)
             subscriber.tags[tag.id] = options
         for id in added:
             self._devices_of_tag.setdefault(id, set()).add(device.id)
@@ -162,7 +162,7 @@ class Registry:
         source.plan.check(list((device.tags | dict(subscription.tags)).values()))
         return source, former
 
-    def _shared_tag(self, tag: Tag) -> Tag:
+    def _shared_tag(self, tag: ScannedTag) -> ScannedTag:
         """Returns an equal tag of another device, if there is one.
 
         Installations have many devices of one type, so sharing the objects saves most memory.
@@ -231,7 +231,7 @@ class Registry:
         id = self._subjects.get(name)
         return None if id is None else self.devices[id]
 
-    def commanded(self, name: str) -> tuple[ScannedDevice, Tag]:
+    def commanded(self, name: str) -> tuple[ScannedDevice, ScannedTag]:
         """Returns the tag of a command's name: an id, or device and id. Raises `Refused`."""
         if len(name) > MAX_DEVICE_ID + len(".") + MAX_ID:
             raise Refused(f"no tag has a name of {len(name)} characters")

@@ -22,7 +22,7 @@ from holdfast.scanner.messages.types import TagRequest
 from holdfast.scanner.subscriptions.device import NO_OPTIONS, Source, TagOptions
 from holdfast.scanner.subscriptions.key import SubscriptionKey
 from holdfast.scanner.subscriptions.plan import Plan
-from holdfast.scanner.subscriptions.tag import AREA_OF_CODE, CODE_OF_AREA, Tag
+from holdfast.scanner.subscriptions.tag import AREA_OF_CODE, CODE_OF_AREA, ScannedTag
 from holdfast.scanner.subscriptions.write_access import read_only
 from holdfast.tags.tag import as_decoded
 from holdfast.types import BIT_AREAS, SERIAL_FRAMES
@@ -53,7 +53,7 @@ class Subscription:
     source: Source
     given_settings: frozenset[str]
     """The settings that the request contains. Others are those of the known device, or defaults."""
-    tags: Mapping[str, Tag]
+    tags: Mapping[str, ScannedTag]
     options: Mapping[str, TagOptions]
     rate: int
     publish: Publish
@@ -152,7 +152,7 @@ NO_MARKERS: frozenset[Marker] = frozenset()
 
 def requested_tags(
     request: SubscribeRequest, rules: Rules, adjustments: Adjustments, *, expands: bool = True
-) -> tuple[dict[str, Tag], dict[str, TagOptions]]:
+) -> tuple[dict[str, ScannedTag], dict[str, TagOptions]]:
     """Returns the tags of a request by id, and what it sets for each. Raises `Refused`.
 
     A tag of the request replaces that of its profile.
@@ -164,7 +164,7 @@ def requested_tags(
     entries = [(f"profile {request.profile}", entry) for entry in of_profile]
     entries += ((f"tags[{index}]", entry) for index, entry in enumerate(request.tags))
     options = {entry.id: _options(entry) for _, entry in entries}
-    found: dict[str, Tag] = {}
+    found: dict[str, ScannedTag] = {}
     for where, entry in entries:
         made = _tag(entry, order, where, rules, adjustments)
         before = found.get(made.id)
@@ -207,7 +207,7 @@ def _options(entry: TagRequest) -> TagOptions:
 
 def _tag(
     request: TagRequest, order: str, where: str, rules: Rules, adjustments: Adjustments
-) -> Tag:
+) -> ScannedTag:
     """Creates the tag of a request; `order` is the default byte order. Raises `Refused`.
 
     Unless the rules are strict, a number in an area of bits becomes a boolean, and `writable` is
@@ -244,7 +244,7 @@ def _tag(
             f"{where}: {name} from address {request.address}: the last address is {LAST_ADDRESS}"
         )
     null = _null_markers(request, type, where)
-    made = Tag(request.id, area, request.address, name, order, null, request.encoding)
+    made = ScannedTag(request.id, area, request.address, name, order, null, request.encoding)
     if request.writable and (flaw := read_only(made)) is not None:
         if area in WRITE_LIMITS or rules.strict:
             raise Refused(f"{where}: {flaw}")
@@ -275,13 +275,13 @@ def _profile_requests(name: str, rules: Rules) -> list[TagRequest]:
     ]
 
 
-def _of_profile(name: str, id: str, where: str, rules: Rules) -> Tag:
+def _of_profile(name: str, id: str, where: str, rules: Rules) -> ScannedTag:
     profile = _profile(name, f"{where}.profile", rules)
     if id not in profile:
         raise Refused(f"{where}: the profile {name} has no tag {id!r}")
     tag = profile[id]
     made = (tag.area, tag.address, tag.type, tag.order, frozenset(tag.null), tag.encoding)
-    return Tag(id, *made, profile=name, meaning=tag)
+    return ScannedTag(id, *made, profile=name, profile_tag=tag)
 
 
 def _profile(name: str, where: str, rules: Rules) -> tags.TagList:

@@ -32,7 +32,7 @@ KINDS: dict[str, DataType] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Tag(BaseTag):
+class ScannedTag(BaseTag):
     """A tag of a device. Two tags are the same if all fields are equal."""
 
     id: str
@@ -46,32 +46,32 @@ class Tag(BaseTag):
     """The encoding of text; `None` for ASCII."""
     profile: str | None = None
     """The profile that the tag is from."""
-    meaning: tags.Tag | None = None
-    """The tag of the profile: scale, limits of writes, names of states."""
+    profile_tag: tags.Tag | None = None
+    """The tag in the profile, with scale, limits of writes and names of states."""
 
     @property
     def source(self) -> tags.Tag | None:
         """The register that contains the scale, if one does."""
-        return None if self.meaning is None else self.meaning.source
+        return None if self.profile_tag is None else self.profile_tag.source
 
     def value(self, raw: Any) -> Any:
         """The value of what the registers hold; `None` if none is available."""
         if type(raw) is Undecoded:
             return raw
-        if self.meaning is not None:
-            return self.meaning.value(raw)
+        if self.profile_tag is not None:
+            return self.profile_tag.value(raw)
         if type(raw) is list:
             return [None if self.is_null(item) else item for item in raw]
         return None if self.is_null(raw) else raw
 
     def published(self, value: Any) -> Any:
         """A value as it is published: that of a profile with the digits of its type."""
-        return value if self.meaning is None else plain(self.meaning, value)
+        return value if self.profile_tag is None else plain(self.profile_tag, value)
 
     def scaled(self, raw: Any, content: Any) -> Scaled:
         """The value, from its registers and the register that contains its scale."""
-        assert self.meaning is not None, "only tags of profiles have a scale"
-        return self.meaning.scaled(raw, content)
+        assert self.profile_tag is not None, "only tags of profiles have a scale"
+        return self.profile_tag.scaled(raw, content)
 
     @property
     def requested_type(self) -> str:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.values.scanner_settings import Writes
     from holdfast.scanner.subscriptions.device import ScannedDevice
-    from holdfast.scanner.subscriptions.tag import Tag
+    from holdfast.scanner.subscriptions.tag import ScannedTag
 
 TAGS: dict[Writes, str] = {
     "tags": 'every subscribed coil and holding register without "writable": false',
@@ -30,14 +30,14 @@ NARROWER: dict[Writes, str] = {
 """What else each setting could be that allows less."""
 
 
-def unwritable(device: ScannedDevice, tag: Tag) -> str | None:
+def unwritable(device: ScannedDevice, tag: ScannedTag) -> str | None:
     """Returns why a tag of a device can't be written; `None` if it can.
 
     A subscriber that declares it writable decides, then one that declares it read-only.
     """
     if (flaw := read_only(tag)) is not None:
         return flaw
-    if tag.meaning is not None and not tag.meaning.writable:
+    if tag.profile_tag is not None and not tag.profile_tag.writable:
         return f"writable is not true in the profile {tag.profile}"
     if device.writes == "none":
         return "this scanner writes nothing (nats.writes is none)"
@@ -54,7 +54,7 @@ def unwritable(device: ScannedDevice, tag: Tag) -> str | None:
     )
 
 
-def read_only(tag: Tag) -> str | None:
+def read_only(tag: ScannedTag) -> str | None:
     """Returns why no Modbus request can write a tag; `None` if one can."""
     if tag.area not in WRITE_LIMITS:
         return f"functionCode {CODE_OF_AREA[tag.area]} is not writable"
