@@ -106,7 +106,7 @@ def settings(name: str, url: str, writes: Writes = "tags") -> Settings:
 
 def partitions(running: Running) -> int:
     member = member_of(running.scanner)
-    return len(member.fleet.partitions)
+    return len(member.partition_leases.partitions)
 
 
 def share(*nodes: Running) -> None:
@@ -401,15 +401,17 @@ def test_wall_time_may_jump(
         [timed, *_] = judges.devices
         subscribed(caller, 0, timed, scanRate=100, ttl=3600)
         now = time.time
-        taken = [as_member(each).fleet.leases.held for each in nodes]
+        taken = [as_member(each).partition_leases.leases.held for each in nodes]
         for jump in (86_400.0, -86_400.0, 0.0):
             monkeypatch.setattr(time, "time", lambda jump=jump: now() + jump)
             monkeypatch.setattr(time, "time_ns", lambda jump=jump: int((now() + jump) * 1e9))
             subscribed(caller, 1, judges.devices[1], scanRate=100, ttl=3600)
-            revisions = [as_member(each).fleet.leases.revision("partition.0") for each in nodes]
+            revisions = [
+                as_member(each).partition_leases.leases.revision("partition.0") for each in nodes
+            ]
             wire.until(partial(are_renewed, nodes, revisions), "leases are renewed")
             until_scanned(judges)
-        assert [as_member(each).fleet.leases.held for each in nodes] == taken
+        assert [as_member(each).partition_leases.leases.held for each in nodes] == taken
         assert not logged(caplog, "lease_lost")
         assert not logged(caplog, "expired")
         assert known(caller) == EVERYTHING
@@ -421,7 +423,9 @@ def as_member(running: Running) -> Any:
 
 
 def are_renewed(nodes: list[Running], revisions: list[int]) -> bool:
-    found: int = sum(as_member(each).fleet.leases.revision("partition.0") for each in nodes)
+    found: int = sum(
+        as_member(each).partition_leases.leases.revision("partition.0") for each in nodes
+    )
     return found > sum(revisions)
 
 

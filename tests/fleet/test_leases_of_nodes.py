@@ -56,7 +56,8 @@ def share(*nodes: Running) -> None:
     """Waits until each node has its share of the partitions."""
     each = [PARTITIONS // len(nodes)] * len(nodes)
     wire.until(
-        lambda: [len(as_member(node).fleet.partitions) for node in nodes] == each, "they are shared"
+        lambda: [len(as_member(node).partition_leases.partitions) for node in nodes] == each,
+        "they are shared",
     )
 
 
@@ -101,7 +102,7 @@ def test_a_busy_event_loop_loses_no_device(
     share(one, two)
     subscribe(own_nats, judges)
     polled(judges)
-    fleet, seen = as_member(one).fleet, as_member(two).fleet.leases.seen
+    fleet, seen = as_member(one).partition_leases, as_member(two).partition_leases.leases.seen
     held = dict(fleet.leases.held)
 
     async def be_busy() -> None:
@@ -128,7 +129,7 @@ def test_others_take_over_from_a_node_whose_event_loop_hangs(
     one, two = node("a", BRIEF), node("b", BRIEF)
     share(one, two)
     subscribe(own_nats, judges)
-    leases = as_member(one).fleet
+    leases = as_member(one).partition_leases
     heartbeat, leases.heartbeat = leases.heartbeat, Hangs()  # type: ignore[assignment]
     share(two)
     polled(judges)
@@ -162,7 +163,7 @@ def test_the_connection_of_leases_is_made_again(
     one, two = node("a"), node("b")
     share(one, two)
     subscribe(own_nats, judges)
-    leases, thread = as_member(one).fleet.leases, as_member(one).fleet._thread
+    leases, thread = as_member(one).partition_leases.leases, as_member(one).partition_leases._thread
     client = leases._client
     assert client is not None
     assert thread._loop is not None
@@ -175,9 +176,9 @@ def test_the_connection_of_leases_is_made_again(
 def test_the_thread_of_leases_ends_with_the_node(node: Callable[..., Running]) -> None:
     one = node("a")
     share(one)
-    thread = as_member(one).fleet._thread._thread
+    thread = as_member(one).partition_leases._thread._thread
     assert thread is not None
     assert thread.is_alive()
     one.stop()
     assert not thread.is_alive()
-    assert not as_member(one).fleet.leases.held
+    assert not as_member(one).partition_leases.leases.held

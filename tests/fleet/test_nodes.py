@@ -106,7 +106,7 @@ def wanted(judge: Judge, number: int = 0, **more: Any) -> dict[str, Any]:
 
 def partitions(running: Running) -> int:
     member = member_of(running.scanner)
-    return len(member.fleet.partitions)
+    return len(member.partition_leases.partitions)
 
 
 def subscribe_all(caller: Caller, judges: Judges) -> None:
@@ -758,7 +758,7 @@ def test_messages_over_a_new_connection_have_a_greater_number(
     wire.until(lambda: all(map(bool, numbers.values())), "values and a status come")
     [first] = set(numbers["data"])
     member, client = member_of(one.scanner), client_of(one.scanner)
-    leases = member.fleet.leases
+    leases = member.partition_leases.leases
     held = next(key for key, since in leases.held.items() if since == first)
     wire.until(lambda: leases.revision(held) > first, "the lease is renewed")
     one.do(client.force_reconnect())

@@ -760,10 +760,10 @@ def test_what_is_remembered_without_jetstream_is_limited(monkeypatch: pytest.Mon
     owners = [SubscriptionKey("plc1", f"s{number}") for number in range(5)]
     for ids in (["a", "b"], ["b"], [f"{number}" for number in range(1, 100)]):
         for owner in owners[:2]:
-            stored.unsubscribed(owner.removal(ids))
+            stored.on_unsubscribed(owner.removal(ids))
     assert sum(len(each.ids or ()) for each in stored.removals(())) == 5
     for owner in owners:
-        stored.unsubscribed(owner.removal())
+        stored.on_unsubscribed(owner.removal())
     assert len([*stored.removals(())]) == 3
 
 
@@ -853,7 +853,7 @@ def test_what_is_changed_without_jetstream_and_refused_after_a_reload_is_stored(
     wire.until(lambda: tags_by_subscription(own_caller) == wanted, "it is accepted")
 
 
-class HostWithoutEntries:
+class ControlWithoutEntries:
     """Stands for the scanner of stored subscriptions."""
 
     def __init__(self) -> None:
@@ -875,13 +875,13 @@ def test_a_refused_request_of_a_former_scanner_is_tried_again_and_handed_over() 
     stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), Rules())
     carried_out: list[SubscribeRequest] = []
 
-    class Host(HostWithoutEntries):
+    class Control(ControlWithoutEntries):
         async def restore(self, request: SubscribeRequest) -> None:
             carried_out.append(request)
 
-    stored._device_host = stored._host = Host()  # type: ignore[assignment]
-    stored.unsubscribed(owner.removal())
-    assert stored.retries(newer)
+    stored._device_control = stored._subscription_control = Control()  # type: ignore[assignment]
+    stored.on_unsubscribed(owner.removal())
+    assert stored.take_over_refused(newer)
     stored._on_read([("modbus.subscription.hmi.plc1.0", msgspec.json.encode(older))])
     # Until it is stored, the next scanner must remove what only the older request has.
     assert [*stored.removals(())] == [owner.removal(["a"])]
@@ -893,7 +893,7 @@ def test_a_pending_subscription_that_a_caller_ends_meanwhile_is_not_carried_out(
     owner = SubscriptionKey("plc1", "hmi")
     carried_out: list[SubscribeRequest] = []
 
-    class Host(HostWithoutEntries):
+    class Control(ControlWithoutEntries):
         def __init__(self) -> None:
             super().__init__()
             self.waits = asyncio.Event()
@@ -907,16 +907,17 @@ def test_a_pending_subscription_that_a_caller_ends_meanwhile_is_not_carried_out(
 
     async def run(*, ends: bool) -> None:
         stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), Rules())
-        stored._device_host = stored._host = host = Host()  # type: ignore[assignment]
+        control: Any = Control()
+        stored._device_control = stored._subscription_control = control
         tags = [TagRequest("a", 0, "holding", "int16")]
         value = msgspec.json.encode(SubscribeRequest("plc1", "hmi", tags, host="127.0.0.1"))
         stored._on_read([("modbus.subscription.hmi.plc1.0", value)])
-        async with host.lock("plc1"):
-            host.waits.clear()
+        async with control.lock("plc1"):
+            control.waits.clear()
             restoring = asyncio.create_task(stored._restore_all())
-            await asyncio.wait_for(host.waits.wait(), wire.DEADLINE)
+            await asyncio.wait_for(control.waits.wait(), wire.DEADLINE)
             if ends:
-                stored.unsubscribed(owner.removal())
+                stored.on_unsubscribed(owner.removal())
         await restoring
 
     asyncio.run(run(ends=False))
@@ -928,7 +929,7 @@ def test_a_pending_subscription_that_a_caller_ends_meanwhile_is_not_carried_out(
 def test_a_request_does_not_wait_for_all_parts_of_a_refused_subscription() -> None:
     tried: list[SubscribeRequest] = []
 
-    class Host(HostWithoutEntries):
+    class Control(ControlWithoutEntries):
         def __init__(self) -> None:
             super().__init__()
             self.has_begun = asyncio.Event()
@@ -945,7 +946,8 @@ def test_a_request_does_not_wait_for_all_parts_of_a_refused_subscription() -> No
 
     async def run() -> None:
         stored = StoredSubscriptions("modbus", Registry(ScannerLimits()), Rules())
-        stored._device_host = stored._host = host = Host()  # type: ignore[assignment]
+        control: Any = Control()
+        stored._device_control = stored._subscription_control = control
         entries = []
         for number in range(5):
             tags = [TagRequest(f"t{number}", number, "holding", "int16")]
@@ -954,11 +956,11 @@ def test_a_request_does_not_wait_for_all_parts_of_a_refused_subscription() -> No
             entries.append((key, msgspec.json.encode(request)))
         stored._on_read(entries)
         restoring = asyncio.create_task(stored._restore_all())
-        await asyncio.wait_for(host.has_begun.wait(), wire.DEADLINE)
-        async with host.lock("plc1"):
+        await asyncio.wait_for(control.has_begun.wait(), wire.DEADLINE)
+        async with control.lock("plc1"):
             assert len(tried) == 2
             # What this request changes is not carried out as it was stored.
-            stored.unsubscribed(SubscriptionKey("plc1", "hmi").removal(["t4"]))
+            stored.on_unsubscribed(SubscriptionKey("plc1", "hmi").removal(["t4"]))
         await restoring
         assert len(tried) == 2
 

@@ -186,7 +186,7 @@ def test_a_command_of_another_node_is_refused_by_a_node_whose_loop_did_not_run(
     subscribed(own_caller, 0, judge)
     wire.until(partial(is_done, own_caller, "modbus.command.d0.t0", "1"), "it is written")
     member = member_of(running.scanner)
-    where = subject("modbus", "a", "command", member.fleet.leases.process)
+    where = subject("modbus", "a", "command", member.partition_leases.leases.process)
     command = msgspec.json.encode(Command(device="d0", tag="t0", text="3", epoch=0))
     # The thread of its leases goes on: the node has the device all the time.
     blocked = Blocked(running)
@@ -218,7 +218,7 @@ def test_a_command_of_another_node_waits_as_long_as_that_node_allows(
         return 0
 
     monkeypatch.setattr(polling_of(running.scanner), "write", write)
-    where = subject("modbus", "a", "command", member.fleet.leases.process)
+    where = subject("modbus", "a", "command", member.partition_leases.leases.process)
     for within in (4.0, 60.0):
         command = Command(device="d0", tag="t0", text="3", epoch=0, within=within)
         answer = send(own_caller, where, msgspec.json.encode(command)).result(wire.DEADLINE)

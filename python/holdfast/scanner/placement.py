@@ -8,7 +8,7 @@ Everything in which these differ is here.
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar
 
 from holdfast.net.nats.outbox import Outbox
 
@@ -47,8 +47,11 @@ if TYPE_CHECKING:
 Changed = TypeVar("Changed")
 """What a change of subscriptions returns."""
 
+LocalWrite: TypeAlias = "Callable[[Callable[[], float]], Awaitable[None]]"
+"""Writes the value of a command to its device, as `LocalCommands.write` with its `remaining_s`."""
 
-class DeviceHost(Protocol):
+
+class DeviceControl(Protocol):
     """The devices of the scanner."""
 
     def lock(self, device: str) -> asyncio.Lock:
@@ -64,7 +67,7 @@ class DeviceHost(Protocol):
         """Publishes that a device is offline whose stored subscription is refused."""
 
 
-class SubscriptionHost(Protocol):
+class SubscriptionControl(Protocol):
     """Carries out what is stored."""
 
     def is_entry(self, subscription: SubscriptionKey) -> bool:
@@ -82,7 +85,7 @@ class SubscriptionHost(Protocol):
         """
 
 
-class CommandHost(Protocol):
+class LocalCommands(Protocol):
     """The commands to devices that this scanner polls."""
 
     def remaining_s(self, message: Msg) -> float:
@@ -104,7 +107,7 @@ class ReportHandlers(Protocol):
         """Returns the latest values as JSON. Raises `Refused`."""
 
 
-class ReportHost(ReportHandlers, Protocol):
+class LocalReports(ReportHandlers, Protocol):
     """Reports of what this scanner knows."""
 
     def request(self, message: Msg, kind: type[Decoded]) -> Decoded:
@@ -147,7 +150,7 @@ class Placement:
         """Sets the client; `None` while there is no connection."""
 
     async def run(
-        self, _devices: DeviceHost, _subscriptions: SubscriptionHost, ready: asyncio.Event, /
+        self, _devices: DeviceControl, _subscriptions: SubscriptionControl, ready: asyncio.Event, /
     ) -> None:
         """Restores subscriptions and stores changes until it is cancelled.
 
@@ -162,15 +165,15 @@ class Placement:
     async def close(self) -> None:
         """Removes the states of devices, which would be out of date."""
 
-    def subscribed(
-        self, _device: ScannedDevice, _subscription: Subscription, _is_stored: bool, /
+    def on_subscribed(
+        self, _device: ScannedDevice, _subscription: Subscription, /, *, is_stored: bool
     ) -> None:
         """Notes that a device is known from now on.
 
         The subscription must be stored, unless it is stored already.
         """
 
-    def dropped(self, device: ScannedDevice) -> None:
+    def on_dropped(self, device: ScannedDevice) -> None:
         """Notes that a device is known no more."""
 
     def is_own(self, _device: ScannedDevice, /) -> bool:
@@ -209,11 +212,11 @@ class Placement:
         Raises `Refused` if it can't be known.
         """
 
-    def unsubscribed(self, request: UnsubscribeRequest) -> None:
+    def on_unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Notes that tags of a subscription are removed."""
 
-    def retries(self, _refused: SubscribeRequest, /) -> bool:
-        """Whether it stores a refused request of a former scanner, and tries it again itself."""
+    def take_over_refused(self, _refused: SubscribeRequest, /) -> bool:
+        """Stores a refused request of a former scanner, to try it again. Returns whether it did."""
         return False
 
     def handed_over(self, request: SubscribeRequest, /) -> SubscribeRequest:
@@ -227,10 +230,10 @@ class Placement:
         """
         return (owner.removal() for owner in known)
 
-    def state_changed(self, device: str) -> None:
+    def on_state_changed(self, device: str) -> None:
         """Notes that the state of a device has changed, or that the device is gone."""
 
-    async def settled(
+    async def wait_until_stored(
         self, _subscription: SubscriptionKey, _tags: Collection[str] = (), /
     ) -> str | None:
         """Waits until a changed subscription is stored; not while JetStream fails.
@@ -244,17 +247,17 @@ class Placement:
         _device: ScannedDevice,
         _tag: ScannedTag,
         _text: str,
-        own: Callable[[Callable[[], float]], Awaitable[None]],
+        write_here: LocalWrite,
         remaining_s: Callable[[], float],
         /,
     ) -> None:
         """Has a command carried out by the scanner that polls the device. Raises `Refused`.
 
-        `remaining_s` refuses it if it is too late, and returns how many seconds it may wait. `own`
-        carries it out here, and calls that at the last moment. It raises `Moved`, and writes
-        nothing, if the device has moved.
+        `remaining_s` refuses it if it is too late, and returns how many seconds it may wait.
+        `write_here` carries it out in this scanner, and calls `remaining_s` immediately before it
+        sends the write. It raises `Moved`, and writes nothing, if the device has moved.
         """
-        await own(remaining_s)
+        await write_here(remaining_s)
 
     def is_addressed(self, _payload: bytes, /) -> bool:
         """Whether a shutdown message is for this scanner, and not for another node."""
@@ -274,14 +277,14 @@ class Placement:
         """Returns what `browse` reports of the fleet."""
         return None
 
-    def reports(self, own: ReportHost) -> ReportHandlers:
+    def reports(self, own: LocalReports) -> ReportHandlers:
         """Returns what answers requests for reports, from those of this scanner."""
         return own
 
     def handlers(
         self,
-        _commands: CommandHost,
-        _reports: ReportHost,
+        _commands: LocalCommands,
+        _reports: LocalReports,
         _responder: Responder,
         _end: Callable[[], None],
         /,

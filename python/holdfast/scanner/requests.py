@@ -150,7 +150,9 @@ class Requests:
                 )
             self._renew_former(subscription)
         # Outside the lock: storing can take seconds, and other requests need not wait for it.
-        unstored = await self._placement.settled(subscription.key, subscription.tags.keys())
+        unstored = await self._placement.wait_until_stored(
+            subscription.key, subscription.tags.keys()
+        )
         self._log.adjusted(subscription.subscriber, subscription.device, adjustments)
         self._log.byte_orders(subscription, adjustments, new)
         self._log.subscribed(subscription)
@@ -188,7 +190,7 @@ class Requests:
             left = [each for whole in former for each in without([whole], ids, profiles)]
             if left:
                 self.former[owner] = left
-        await self._placement.settled(owner)
+        await self._placement.wait_until_stored(owner)
         self._log.adjusted(request.subscriber_id, request.device_id, adjustments)
         self._log.unsubscribed(request, was_known=was_known or bool(former))
         return Answer(success=True)

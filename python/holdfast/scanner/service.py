@@ -188,10 +188,10 @@ class Scanner:
         refused = [whole for whole, ok in zip(wholes, outcomes, strict=True) if not ok]
         # Before the refused requests, which replace what is stored.
         for removal in removals:
-            self._placement.unsubscribed(removal)
+            self._placement.on_unsubscribed(removal)
         for whole in refused:
             # The subscriber of one with a `ttl` repeats it.
-            if self._placement.retries(whole) or whole.ttl is None:
+            if self._placement.take_over_refused(whole) or whole.ttl is None:
                 owner = SubscriptionKey.of(whole)
                 self._requests.former.setdefault(owner, []).append(whole)
 

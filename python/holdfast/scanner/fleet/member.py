@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from holdfast.replication.leases.thread import Connect, StartThread
     from holdfast.scanner.fleet.agreement import Terms
     from holdfast.scanner.messages.types import SubscribeRequest
-    from holdfast.scanner.placement import DeviceHost, SubscriptionHost
+    from holdfast.scanner.placement import DeviceControl, SubscriptionControl
     from holdfast.scanner.settings import FleetSettings
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
@@ -72,7 +72,7 @@ class FleetMember(Placement):
         start_thread: StartThread,
     ) -> None:
         """`connect` makes a connection for the leases alone, `start_thread` starts their thread."""
-        self.fleet = PartitionLeases(
+        self.partition_leases = PartitionLeases(
             settings,
             terms,
             about,
@@ -103,22 +103,22 @@ class FleetMember(Placement):
         """Sets the client; `None` while there is no connection."""
         self.client = client
         self._has_new_client.set()
-        self.fleet.connected(is_connected=client is not None)
+        self.partition_leases.connected(is_connected=client is not None)
 
     async def run(
-        self, devices: DeviceHost, subscriptions: SubscriptionHost, ready: asyncio.Event, /
+        self, devices: DeviceControl, subscriptions: SubscriptionControl, ready: asyncio.Event, /
     ) -> None:
         """Is a node of the fleet until it is cancelled. Raises `FleetRefused`.
 
         Sets `ready` when it knows the desired state.
         """
-        self._device_host, self._subscription_host = devices, subscriptions
-        self.fleet.start()
+        self._device_control, self._subscription_control = devices, subscriptions
+        self.partition_leases.start()
         try:
-            async with tasks.beating(self.fleet.heartbeat):
+            async with tasks.beating(self.partition_leases.heartbeat):
                 await self._open(ready)
                 works = (
-                    self.fleet.run(),
+                    self.partition_leases.run(),
                     self._follow_again(),
                     self._adopt_changes(),
                     self._adopt_refused(),
@@ -131,21 +131,21 @@ class FleetMember(Placement):
                 finally:
                     await tasks.end(running)
         finally:
-            await self.fleet.stop()
+            await self.partition_leases.stop()
 
     async def _open(self, ready: asyncio.Event) -> None:
         """Joins the fleet, and reads the desired state."""
         while not self.is_joined:
-            client, leases = self.client, self.fleet.leases
+            client, partitions = self.client, self.partition_leases
+            leases, terms = partitions.leases, partitions.terms
             if client is None or leases.reason is not None or not leases.is_read:
                 await asyncio.sleep(CONNECTION_CHECK_S)
                 continue
             try:
-                fleet = self.fleet
-                await self.desired.open(client, fleet.terms, fleet.has_terms, has_joined=False)
+                await self.desired.open(client, terms, partitions.has_terms, has_joined=False)
                 self._has_new_client.clear()
-                await fleet.join()
-                await self.desired.agree(fleet.terms, fleet.has_terms, may_replace=True)
+                await partitions.join()
+                await self.desired.agree(terms, partitions.has_terms, may_replace=True)
                 await self._read(ready)
                 self.is_joined = True
                 self._backoff.succeeded()
@@ -180,7 +180,9 @@ class FleetMember(Placement):
                         continue
             self._has_new_client.clear()
             try:
-                await self.desired.open(client, self.fleet.terms, lambda _: True, has_joined=True)
+                await self.desired.open(
+                    client, self.partition_leases.terms, lambda _: True, has_joined=True
+                )
             except (Error, OSError) as error:
                 await self._pause(error)
                 self._has_new_client.set()
@@ -214,7 +216,7 @@ class FleetMember(Placement):
         self._has_touched.set()
 
     async def _adopt(self, device: str) -> None:
-        async with self._device_host.lock(device):
+        async with self._device_control.lock(device):
             await self._adopt_locked(device)
 
     async def _adopt_locked(self, device: str) -> None:
@@ -224,7 +226,7 @@ class FleetMember(Placement):
     async def refresh(self, device: str, /) -> None:
         """Carries out the latest change of a device. Raises `Refused` if it can't be read."""
         # Under the lock: reads may overtake each other, and commands must stay in order.
-        async with self._device_host.lock(device):
+        async with self._device_control.lock(device):
             await self._read_newer(device, "not written")
             await self._adopt_locked(device)
 
@@ -249,12 +251,12 @@ class FleetMember(Placement):
             for text in () if desired is None else desired.requests:
                 request = restored(bytes(text))
                 by_subscriber.setdefault(request.subscriber_id, []).append(request)
-            await self._subscription_host.adopt(device, by_subscriber, renewed)
+            await self._subscription_control.adopt(device, by_subscriber, renewed)
         except Refused as refused:
             log_lines.refused("not_restored", kind="fleet", device=device, reason=str(refused))
             self._refused.add(device)
             # What it was before must not go on: programs count on the new address and tags.
-            await self._subscription_host.adopt(device, {}, set())
+            await self._subscription_control.adopt(device, {}, set())
             self._applied.pop(device, None)
             self._renewed.pop(device, None)
             return refused
@@ -348,16 +350,21 @@ class FleetMember(Placement):
                 "use fewer tags, or set max_payload of the NATS server"
             )
 
-    def subscribed(
-        self, device: ScannedDevice, _subscription: Subscription, _is_stored: bool, /
+    def on_subscribed(
+        self,
+        device: ScannedDevice,
+        _subscription: Subscription,
+        /,
+        *,
+        is_stored: bool,  # noqa: ARG002
     ) -> None:
         """A device is known from now on. `store` stores its subscriptions."""
         device.partition = partition_of(
-            connection_of(device.source.target), self.fleet.settings.partitions
+            connection_of(device.source.target), self.partition_leases.settings.partitions
         )
         self._devices.setdefault(device.partition, {})[device.id] = device
 
-    def dropped(self, device: ScannedDevice) -> None:
+    def on_dropped(self, device: ScannedDevice) -> None:
         """A device is known no more."""
         of_partition = self._devices.get(device.partition, {})
         if of_partition.get(device.id) is device:
@@ -369,7 +376,7 @@ class FleetMember(Placement):
 
     def is_own(self, device: ScannedDevice, /) -> bool:
         """Whether this node polls a device, now."""
-        return self.fleet.is_own(device.partition)
+        return self.partition_leases.is_own(device.partition)
 
     def takes_writes(self, device: ScannedDevice, /) -> bool:
         """Whether this node can write to a device, now."""
@@ -377,15 +384,15 @@ class FleetMember(Placement):
 
     def lease(self, device: ScannedDevice, /) -> int:
         """Returns the number in the header of messages: that of a later node is greater."""
-        return self.fleet.epoch(device.partition)
+        return self.partition_leases.epoch(device.partition)
 
     def fence(self, device: ScannedDevice, /) -> _core.Fence:
         """The fence of a device."""
-        return self.fleet.fence(device.partition)
+        return self.partition_leases.fence(device.partition)
 
     def is_current(self, device: ScannedDevice, epoch: int) -> bool:
         """Whether this node has the lease of a device since that revision, or a later one."""
-        return self.is_own(device) and self.fleet.revision(device.partition) >= epoch
+        return self.is_own(device) and self.partition_leases.revision(device.partition) >= epoch
 
     @property
     def refused(self) -> int:
@@ -395,23 +402,23 @@ class FleetMember(Placement):
     @property
     def own(self) -> Iterator[ScannedDevice]:
         """The devices that this node polls."""
-        for partition in self.fleet.partitions:
+        for partition in self.partition_leases.partitions:
             yield from self._devices.get(partition, {}).values()
 
     def _gained(self, partition: int) -> None:
         for device in list(self._devices.get(partition, {}).values()):
-            self._device_host.begin(device)
+            self._device_control.begin(device)
 
     def _lost(self, partition: int) -> None:
         for device in list(self._devices.get(partition, {}).values()):
-            self._device_host.end(device)
+            self._device_control.end(device)
 
     async def leave(self) -> None:
         """Hands all devices over to other nodes."""
         if not self.is_joined:
             return
-        log_lines.write(logging.INFO, "fleet_leaving", fleet=self.fleet.settings.name)
+        log_lines.write(logging.INFO, "fleet_leaving", fleet=self.partition_leases.settings.name)
         # Whatever fails here, the leases end by themselves, and others take over then.
         with contextlib.suppress(Exception):
             async with asyncio.timeout(LEAVE_TIMEOUT_S):
-                await self.fleet.leave()
+                await self.partition_leases.leave()

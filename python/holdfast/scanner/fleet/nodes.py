@@ -26,14 +26,14 @@ from holdfast.scanner.messages.types import Answer
 from holdfast.scanner.reports.variables import fitting, joined
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Callable
 
     from nats.aio.msg import Msg
 
     from holdfast.replication.leases.bucket import Holding
     from holdfast.scanner.fleet.member import FleetMember
     from holdfast.scanner.fleet.questions import Reply
-    from holdfast.scanner.placement import CommandHost, ReportHost
+    from holdfast.scanner.placement import LocalCommands, LocalReports, LocalWrite
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
 
@@ -90,8 +90,8 @@ class OtherNodes:
     def __init__(self, prefix: str, member: FleetMember) -> None:
         self._prefix = prefix
         self._member = member
-        self._fleet = member.fleet
-        self._move_timeout_s = 2 * self._fleet.settings.lease_times.ttl_s
+        self._partition_leases = member.partition_leases
+        self._move_timeout_s = 2 * self._partition_leases.settings.lease_times.ttl_s
         """How long a command waits for a node that polls its device, once it has found none: twice
         a takeover."""
         self._numbers = count()
@@ -104,7 +104,7 @@ class OtherNodes:
         device: ScannedDevice,
         tag: str,
         text: str,
-        own: Callable[[Callable[[], float]], Awaitable[None]],
+        write_here: LocalWrite,
         remaining_s: Callable[[], float],
     ) -> None:
         """Has a command carried out by the node that polls the device. Raises `Refused`.
@@ -138,12 +138,12 @@ class OtherNodes:
                 if order.is_overtaken(number):
                     passed = f"a later command to {device.id} went before it"
                     raise Refused(f"not written: {passed}; {SEND_AGAIN}")
-                owner = self._fleet.holder(device.partition)
+                owner = self._partition_leases.holder(device.partition)
                 if self._member.is_own(device):
                     with contextlib.suppress(Moved):
-                        await own(last_moment)
+                        await write_here(last_moment)
                         return
-                elif owner is not None and self._fleet.is_other(owner):
+                elif owner is not None and self._partition_leases.is_other(owner):
                     flaw = await self._forward(owner, device, tag, text, left, sent)
                     if flaw is None:
                         return
@@ -168,7 +168,7 @@ class OtherNodes:
         sent: Callable[[], None],
     ) -> str | None:
         """Returns why another node did not carry out a command. Raises `Refused` if it tried."""
-        holding = self._fleet.leases.seen.get(f"{PARTITION}{device.partition}")
+        holding = self._partition_leases.leases.seen.get(f"{PARTITION}{device.partition}")
         command = Command(
             device=device.id,
             tag=tag,
@@ -204,8 +204,8 @@ class OtherNodes:
         """
         of_process: dict[str, tuple[Holding, list[str]]] = {}
         for device in devices:
-            owner = self._fleet.holder(device.partition)
-            if owner is not None and self._fleet.is_other(owner):
+            owner = self._partition_leases.holder(device.partition)
+            if owner is not None and self._partition_leases.is_other(owner):
                 of_process.setdefault(owner.process, (owner, []))[1].append(device.id)
         found = await asyncio.gather(
             *(
@@ -250,8 +250,8 @@ class NodeAnswers:
 
     _member: FleetMember
     _registry: Registry
-    _commands: CommandHost
-    _reports: ReportHost
+    _commands: LocalCommands
+    _reports: LocalReports
 
     async def command(self, message: Msg) -> bytes:
         """Carries out a command that another node has received."""

@@ -18,7 +18,7 @@ from holdfast.runtime import tasks
 from holdfast.runtime.heartbeat import Heartbeat
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms, digest
 from holdfast.scanner.fleet.assignment import assigned
-from holdfast.scanner.fleet.giving_back import Handover
+from holdfast.scanner.fleet.handover import Handover
 from holdfast.scanner.settings import FleetSettings
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from holdfast.scanner.fleet.reports import FleetReports
 from holdfast.scanner.messages.types import Answer, FleetReport
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable, Mapping
+    from collections.abc import Callable, Mapping
 
     from nats.aio.client import Client
     from nats.aio.msg import Msg
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
     from holdfast.net.nats.connection import Handler
     from holdfast.replication.leases.thread import StartThread
     from holdfast.scanner.placement import (
-        CommandHost,
+        LocalCommands,
+        LocalReports,
+        LocalWrite,
         ReportHandlers,
-        ReportHost,
     )
     from holdfast.scanner.responder import Responder
     from holdfast.scanner.settings import FleetSettings, Settings
@@ -43,27 +44,29 @@ class FleetPlacement(FleetMember):
     def __init__(
         self,
         settings: Settings,
-        fleet: FleetSettings,
+        fleet_settings: FleetSettings,
         registry: Registry,
         start_thread: StartThread,
     ) -> None:
         """`start_thread` starts the thread of the leases."""
         self._settings = settings
         self._prefix = settings.prefix
-        self.fleet_name = fleet.name
-        self.queue_group = f"holdfast-{fleet.name}"
+        self.fleet_name = fleet_settings.name
+        self.queue_group = f"holdfast-{fleet_settings.name}"
         names = ("subscribe", "unsubscribe", "command.>", "browse", "variables")
         self.shared_subjects = [f"{settings.prefix}.{name}" for name in names]
         self._counts: Callable[[], Mapping[str, int]] = dict
         """What this node has done, from `reports` on."""
-        terms = Terms.of(settings, fleet)
-        super().__init__(fleet, terms, registry, self._about, self._connect_leases, start_thread)
+        terms = Terms.of(settings, fleet_settings)
+        super().__init__(
+            fleet_settings, terms, registry, self._about, self._connect_leases, start_thread
+        )
         self._nodes = OtherNodes(settings.prefix, self)
 
     def outbox(self, repeat_values: Callable[[], None], /) -> Outbox:
         """Returns a queue that sends nothing while other nodes may poll the same devices."""
         return Outbox(
-            may_send=lambda: not self.is_joined or self.fleet.may_publish,
+            may_send=lambda: not self.is_joined or self.partition_leases.may_publish,
             on_drop=repeat_values,
             at_once=True,
         )
@@ -73,46 +76,50 @@ class FleetPlacement(FleetMember):
         device: ScannedDevice,
         tag: ScannedTag,
         text: str,
-        own: Callable[[Callable[[], float]], Awaitable[None]],
+        write_here: LocalWrite,
         remaining_s: Callable[[], float],
         /,
     ) -> None:
         """Has a command carried out by the node that polls the device. Raises `Refused`."""
-        await self._nodes.write(device, tag.id, text, own, remaining_s)
+        await self._nodes.write(device, tag.id, text, write_here, remaining_s)
 
     def is_addressed(self, payload: bytes, /) -> bool:
         """Whether a shutdown message is for all nodes, or for this one."""
-        return shutdown.ends(payload, self.fleet.node)
+        return shutdown.ends(payload, self.partition_leases.node)
 
     @property
     def writes_heartbeat(self) -> bool:
         """Whether this node writes the heartbeat: that with the first partition does."""
-        return self.fleet.is_own(0)
+        return self.partition_leases.is_own(0)
 
     @property
     def has_others(self) -> bool:
         """Whether other nodes go on when this one ends."""
-        return self.fleet.has_others
+        return self.partition_leases.has_others
 
     def report(self) -> FleetReport:
         """Returns what `browse` reports of the fleet."""
-        return FleetReport(self.fleet.settings.name, self.fleet.node, self.fleet.nodes)
+        return FleetReport(
+            self.partition_leases.settings.name,
+            self.partition_leases.node,
+            self.partition_leases.nodes,
+        )
 
-    def reports(self, own: ReportHost) -> ReportHandlers:
+    def reports(self, own: LocalReports) -> ReportHandlers:
         """Returns the reports of all nodes."""
         self._counts = own.counts
         return FleetReports(self._registry, own, self._nodes)
 
     def handlers(
         self,
-        commands: CommandHost,
-        reports: ReportHost,
+        commands: LocalCommands,
+        reports: LocalReports,
         responder: Responder,
         end: Callable[[], None],
         /,
     ) -> Mapping[str, Handler]:
         """Returns the handlers of what other nodes ask, by subject. `end` ends this scanner."""
-        node, process = self.fleet.node, self.fleet.leases.process
+        node, process = self.partition_leases.node, self.partition_leases.leases.process
         answers = NodeAnswers(self, self._registry, commands, reports)
         handlers = {
             subject(self._prefix, node, what, process): responder.answering(what, handle)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from holdfast.scanner.fleet.nodes import OtherNodes
     from holdfast.scanner.messages.types import BrowseAnswer
-    from holdfast.scanner.placement import ReportHost
+    from holdfast.scanner.placement import LocalReports
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
 
@@ -36,7 +36,7 @@ class FleetReports:
     """Reports devices of all nodes."""
 
     _registry: Registry
-    _own: ReportHost
+    _own: LocalReports
     _nodes: OtherNodes
 
     async def browse(self, message: Msg) -> BrowseAnswer:

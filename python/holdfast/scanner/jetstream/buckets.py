@@ -15,7 +15,7 @@ import msgspec
 from holdfast.events import log_lines
 from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.jetstream.entry_subscriptions import EntryHost, EntrySubscriptions
+from holdfast.scanner.jetstream.entry_subscriptions import EntryControl, EntrySubscriptions
 from holdfast.scanner.jetstream.key_watch import KeyWatch
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class EnabledKey:
             self._enable(self.enabled)
 
 
-class BucketHost(EntryHost, Protocol):
+class BucketControl(EntryControl, Protocol):
     """Carries out what programs write."""
 
     def enable(self, is_enabled: bool) -> None:
@@ -115,8 +115,8 @@ class Buckets:
     async def read(self) -> None:
         """Waits until the buckets are read for the first time, but not for long."""
 
-    async def run(self, _host: BucketHost, /) -> None:
-        """Has `host` carry out what is written, until it is cancelled."""
+    async def run(self, _control: BucketControl, /) -> None:
+        """Has `control` carry out what is written, until it is cancelled."""
         await asyncio.Event().wait()
 
 
@@ -158,9 +158,9 @@ class TentacleNextBuckets(Buckets):
         await self._enabled_key.watch.read()
         await self._entries.watch.read()
 
-    async def run(self, host: BucketHost, /) -> None:
-        """Has `host` carry out what is written, until it is cancelled."""
-        host.enable(False)  # Until it is known that the scanner is enabled.
+    async def run(self, control: BucketControl, /) -> None:
+        """Has `control` carry out what is written, until it is cancelled."""
+        control.enable(False)  # Until it is known that the scanner is enabled.
         async with asyncio.TaskGroup() as running:
-            running.create_task(self._entries.run(host))
-            running.create_task(self._enabled_key.run(host.enable))
+            running.create_task(self._entries.run(control))
+            running.create_task(self._enabled_key.run(control.enable))

@@ -71,7 +71,7 @@ class RefusedEntry:
     tags: list[str] = field(default_factory=list)
 
 
-class EntryHost(Protocol):
+class EntryControl(Protocol):
     """Carries out the entries of the bucket."""
 
     def check_entry(self, key: str, value: bytes) -> Subscription:
@@ -108,9 +108,9 @@ class EntrySubscriptions:
         """Returns the key of the entry that a subscription is from; `None` if it is from none."""
         return self._keys.get(subscription)
 
-    async def run(self, host: EntryHost) -> None:
-        """Has `host` carry out the entries, until it is cancelled."""
-        self._host = host
+    async def run(self, control: EntryControl) -> None:
+        """Has `control` carry out the entries, until it is cancelled."""
+        self._control = control
         async with asyncio.TaskGroup() as tasks:
             tasks.create_task(self.watch.run())
             tasks.create_task(self._try_again())
@@ -159,7 +159,7 @@ class EntrySubscriptions:
         subscription, entry.subscription = entry.subscription, None
         if subscription is not None:
             del self._keys[subscription]
-            await self._host.end_entry(subscription)
+            await self._control.end_entry(subscription)
 
     async def _try_again(self) -> None:
         while True:
@@ -204,12 +204,12 @@ class EntrySubscriptions:
         entry = self._entries[key]
         had_subscription = entry.subscription is not None
         try:
-            subscription = self._host.check_entry(key, written.value)
+            subscription = self._control.check_entry(key, written.value)
             if entry.subscription not in (None, subscription.key):
                 await self._release(entry)
             entry.subscription = subscription.key
             self._keys[subscription.key] = key
-            await self._host.carry_out_entry(subscription)
+            await self._control.carry_out_entry(subscription)
         except Refused as refused:
             reason = str(refused)
         except Exception as error:  # An error in one entry must not affect the others.

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from nats.aio.client import Client
 
     from holdfast.scanner.messages.types import SubscribeRequest, UnsubscribeRequest
-    from holdfast.scanner.placement import DeviceHost, SubscriptionHost
+    from holdfast.scanner.placement import DeviceControl, SubscriptionControl
     from holdfast.scanner.subscriptions.device import ScannedDevice
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.request_rules import Rules
@@ -88,14 +88,14 @@ class StoredSubscriptions(Placement):
         self._store.connected(client)
 
     async def run(
-        self, devices: DeviceHost, host: SubscriptionHost, ready: asyncio.Event, /
+        self, devices: DeviceControl, subscriptions: SubscriptionControl, ready: asyncio.Event, /
     ) -> None:
         """Restores and stores, until it is cancelled.
 
-        `host` carries out stored requests. Subscriptions from entries of another bucket are not
+        `subscriptions` carries out stored requests; those from entries of another bucket are not
         stored. Sets `ready` after the first attempt to restore, or when it takes too long.
         """
-        self._device_host, self._host = devices, host
+        self._device_control, self._subscription_control = devices, subscriptions
         async with asyncio.TaskGroup() as running:
             running.create_task(self._store.run())
             running.create_task(self._restore(ready))
@@ -105,8 +105,8 @@ class StoredSubscriptions(Placement):
         with contextlib.suppress(Exception):  # JetStream is optional, and may fail in any way.
             await self._store.stop()
 
-    def subscribed(
-        self, device: ScannedDevice, subscription: Subscription, is_stored: bool, /
+    def on_subscribed(
+        self, device: ScannedDevice, subscription: Subscription, /, *, is_stored: bool
     ) -> None:
         """Stores a subscription that has changed, together with what is pending of it."""
         owner, given = subscription.key, subscription.given_settings
@@ -122,11 +122,11 @@ class StoredSubscriptions(Placement):
             more = device, subscription.subscriber, given, self._profiles
             self._change(owner, pending, with_later(pending.parts, *more))
 
-    def state_changed(self, device: str) -> None:
+    def on_state_changed(self, device: str) -> None:
         """Stores the state of a device; removes it if the device is gone."""
         self._store.touch(SubscriptionKey(device))
 
-    def unsubscribed(self, request: UnsubscribeRequest) -> None:
+    def on_unsubscribed(self, request: UnsubscribeRequest) -> None:
         """Removes tags of a subscription, also of a pending one."""
         owner, ids = SubscriptionKey.of(request), request.ids
         if not self._has_read:
@@ -150,7 +150,7 @@ class StoredSubscriptions(Placement):
             pending.parts, pending.is_changed = parts, True
         self._store.touch(owner)
 
-    def retries(self, refused: SubscribeRequest, /) -> bool:
+    def take_over_refused(self, refused: SubscribeRequest, /) -> bool:
         """Makes a refused request of a former scanner pending. What is stored is older."""
         owner = SubscriptionKey.of(refused)
         if not self._has_read:
@@ -200,11 +200,11 @@ class StoredSubscriptions(Placement):
             if removed := self._pending[owner].removed:  # The entries still have these tags.
                 yield owner.removal(list(removed))
 
-    async def settled(
+    async def wait_until_stored(
         self, subscription: SubscriptionKey, tags: Collection[str] = (), /
     ) -> str | None:
         """Waits until a changed subscription is stored; not while JetStream fails."""
-        if not await self._store.settled(subscription):
+        if not await self._store.wait_until_written(subscription):
             return None
         limit = self._store.max_bytes
         for value in (self._entries(subscription) or {}).values():
@@ -219,7 +219,7 @@ class StoredSubscriptions(Placement):
 
     def _entries(self, owner: SubscriptionKey) -> Mapping[str, bytes] | None:
         """Returns the entries of an owner: nothing, if it is gone; `None` if they stay."""
-        if self._host.is_entry(owner):
+        if self._subscription_control.is_entry(owner):
             return {}
         if (pending := self._pending.get(owner)) is not None:
             if not pending.is_changed or self._is_displaced(owner):
@@ -347,15 +347,15 @@ class StoredSubscriptions(Placement):
             await self._restore_parts(owner, each)
             log_lines.write(logging.WARNING, "not_restored", **owner.fields, reason=str(refused))
             if owner in self._pending:
-                self._device_host.give_up(owner.device, str(refused))
+                self._device_control.give_up(owner.device, str(refused))
 
     async def _restore_one(self, owner: SubscriptionKey) -> Refused | None:
         # Under the lock: a caller may change or end the subscription while this waits for it.
-        async with self._device_host.lock(owner.device):
+        async with self._device_control.lock(owner.device):
             if (pending := self._pending.get(owner)) is None:
                 return None
             try:
-                await self._host.restore(joined(pending.parts))
+                await self._subscription_control.restore(joined(pending.parts))
             except Refused as refused:
                 return refused
             self._touch(owner)
@@ -373,9 +373,11 @@ class StoredSubscriptions(Placement):
             return
         for part in parts:
             # Each under the lock: requests must not wait for the lookups of all.
-            async with self._device_host.lock(owner.device):
+            async with self._device_control.lock(owner.device):
                 if self._pending.get(owner) is not pending or pending.parts is not parts:
                     return  # A caller has changed or ended it.
                 # Without its profile, which would add the tags of other parts.
                 with contextlib.suppress(Refused):
-                    await self._host.restore(with_profile(part, None, self._profiles))
+                    await self._subscription_control.restore(
+                        with_profile(part, None, self._profiles)
+                    )

@@ -110,7 +110,7 @@ class EntryStore:
         self._touched.add(owner)
         self._has_work.set()
 
-    async def settled(self, owner: SubscriptionKey) -> bool:
+    async def wait_until_written(self, owner: SubscriptionKey) -> bool:
         """Waits until the entries of a touched owner are stored; not while JetStream fails.
 
         Returns whether one of them is too large for the server.

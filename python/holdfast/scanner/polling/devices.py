@@ -82,7 +82,7 @@ class Devices:
         if change.former is not None:
             self._drop(change.former)
         device.endpoint = endpoint
-        self._placement.subscribed(device, subscription, is_stored)
+        self._placement.on_subscribed(device, subscription, is_stored=is_stored)
         is_own = self._placement.is_own(device)
         # Where another node polls the device, `begin` makes all of its tags fresh.
         self._publishers.update(device, change.fresh if is_own else ())
@@ -111,7 +111,7 @@ class Devices:
 
     def remove(self, request: UnsubscribeRequest) -> None:
         """Removes tags of a subscription, and polls and publishes accordingly."""
-        self._placement.unsubscribed(request)
+        self._placement.on_unsubscribed(request)
         device, changed = self._registry.unsubscribe(request)
         if device is None:
             return
@@ -123,7 +123,7 @@ class Devices:
                 self._poll(device, at_once=False)
         elif changed:  # It was the last subscriber.
             self._drop(device)
-            self._placement.state_changed(device.id)
+            self._placement.on_state_changed(device.id)
 
     def _poll(self, device: ScannedDevice, *, at_once: bool = True) -> None:
         """Applies changes of a device to the poller, if this scanner polls it."""
@@ -133,7 +133,7 @@ class Devices:
     def _drop(self, device: ScannedDevice) -> None:
         """Removes a device without subscribers."""
         self._publishers.remove(device)
-        self._placement.dropped(device)
+        self._placement.on_dropped(device)
         self._polling.drop(device)
 
     def begin(self, device: ScannedDevice) -> None:

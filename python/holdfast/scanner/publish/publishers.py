@@ -86,7 +86,7 @@ class Publishers:
         )
         # Stored as well as published: a program that starts later reads the last state.
         device.status = msgspec.json.encode(status)
-        self._placement.state_changed(device.id)
+        self._placement.on_state_changed(device.id)
         lease = self._placement.lease(device)
         self._put_status(device.id, device.status, lease)
 
