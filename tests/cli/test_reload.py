@@ -268,10 +268,10 @@ def test_another_path_to_the_same_file_can_be_started(running: Running) -> None:
     other.symlink_to(running.file)
     second = RunCommand(other)
     second.wait_until_it_serves()
-    assert control.is_run(other)
+    assert control.is_running(other)
     running.end()
     # It answers requests for the other path, too, but does not run that.
-    assert not control.is_run(running.file)
+    assert not control.is_running(running.file)
     assert second.end(signal.SIGTERM)[0] == 0
 
 
@@ -280,7 +280,7 @@ def test_a_start_with_another_folder_for_sockets_is_noticed(
 ) -> None:
     """Such as that of a service, and one by hand."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    assert control.is_run(running.file)
+    assert control.is_running(running.file)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="other systems have no such file")
@@ -288,7 +288,7 @@ def test_a_stream_is_another_configuration_each_time(running: Running) -> None:
     stream = Path("/dev/stdin")
     first = control.Control(stream, {})
     try:
-        assert control.is_run(running.file)
-        assert not control.is_run(stream)
+        assert control.is_running(running.file)
+        assert not control.is_running(stream)
     finally:
         first.close()

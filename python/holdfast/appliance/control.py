@@ -122,7 +122,7 @@ class Control:
             return {"error": f"invalid request: {error}"}
 
 
-def is_run(file: Path) -> bool:
+def is_running(file: Path) -> bool:
     """Whether a process that this user has started with this path still runs.
 
     Another path to the same file does not count: with relative paths in it, its appliance is

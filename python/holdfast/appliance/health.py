@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from holdfast.appliance.parts.shared_logs import SharedLogs
     from holdfast.appliance.services.supervision import Supervisor
 
-NAMED = 5
+MAX_NAMES = 5
 """The most names in the detail of a check."""
 
 
@@ -104,5 +104,5 @@ class Health:
 def _named(names: Iterable[str]) -> str:
     """The first names, and how many more there are."""
     found = sorted(names)
-    more = len(found) - NAMED
-    return ", ".join(found[:NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(found) - MAX_NAMES
+    return ", ".join(found[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")

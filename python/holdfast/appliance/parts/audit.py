@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from holdfast.types import ThreadHeartbeat
 
 # The most writes that are moved to the audit log at once.
-BATCH = 1000
+MAX_WRITES_PER_BATCH = 1000
 
 # How long the thread waits for a write. The engine wakes it for each write, and when it stops.
 TIMEOUT_S = PERIOD_S
@@ -147,7 +147,7 @@ class WriteRecorder:
                 self._stopped.wait(RETRY_S)
                 self._audit.retry()
                 continue
-            writes = self._engine.next_writes(0 if ended else TIMEOUT_S, BATCH)
+            writes = self._engine.next_writes(0 if ended else TIMEOUT_S, MAX_WRITES_PER_BATCH)
             lines = [write for write in writes if self._has_line(write)]
             self._count_others()
             more = self._refusals.rest() if ended else self._refusals.take()

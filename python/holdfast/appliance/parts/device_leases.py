@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from holdfast.replication.leases.times import LeaseTimes
     from holdfast.types import ThreadHeartbeat
 
-_ENDING_S = 2.0
+_GIVE_BACK_TIMEOUT_S = 2.0
 """How long to wait for polls and writes in progress before a lease is given back."""
 
 
@@ -177,7 +177,7 @@ class _LogLeases:
         if self._state is _State.RUNNING:
             self._thread.want(devices)
             for key in set(before) - set(devices):
-                self._thread.give_back_soon(key, _ENDING_S)
+                self._thread.give_back_soon(key, _GIVE_BACK_TIMEOUT_S)
         elif self._state is _State.IDLE:
             self.start()
 
@@ -189,7 +189,7 @@ class _LogLeases:
 
     def stop(self) -> None:
         self._state = _State.STOPPED
-        self._thread.stop(_ENDING_S)
+        self._thread.stop(_GIVE_BACK_TIMEOUT_S)
 
     def heartbeat(self) -> ThreadHeartbeat | None:
         return self._thread.heartbeat

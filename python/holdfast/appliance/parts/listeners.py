@@ -83,7 +83,7 @@ class Listeners(Part):
     def open(self, plan: Plan) -> None:
         """Binds all listeners, and serves."""
         audit = self.config.audit
-        with _advising(plan.config):
+        with _with_permission_hint(plan.config):
             self.engine = _core.Engine(
                 **_settings(plan),
                 workers=self.config.workers,
@@ -97,7 +97,7 @@ class Listeners(Part):
 
     def prepare(self, plan: Plan) -> Callable[[], None]:
         """Takes over all listeners, or refuses all. Every other part is prepared by then."""
-        with _advising(plan.config):
+        with _with_permission_hint(plan.config):
             self.engine.reload(**_settings(plan))
         return super().prepare(plan)
 
@@ -167,8 +167,8 @@ class Listeners(Part):
 
 
 @contextmanager
-def _advising(config: Config) -> Iterator[None]:
-    """Adds what a listener needs that may not be opened; the text of the error begins with it."""
+def _with_permission_hint(config: Config) -> Iterator[None]:
+    """Adds what a listener needs to a `PermissionError`, whose text begins with its name."""
     try:
         yield
     except PermissionError as error:

@@ -166,11 +166,11 @@ class TagValues:
         self.retained: dict[tuple[str, str], str] = {}
         """Of each broker and topic that it retains, the output that published it: see `Site`."""
         self.answers = 0
-        """Changes when a device stops to answer, or answers again."""
+        """Changes when a device stops answering, or answers again."""
         self._heartbeat = Heartbeat()
-        self._ending = threading.Event()
-        self._told = 0
-        """Dropped polls that were logged."""
+        self._stopping = threading.Event()
+        self._reported_dropped = 0
+        """How many of the dropped polls were logged."""
         self._thread = threading.Thread(target=self._run, name="holdfast-tags", daemon=True)
 
     def start(self) -> None:
@@ -181,7 +181,7 @@ class TagValues:
     def stop(self) -> None:
         """Offers nothing from now on: outputs end one by one, and all get the same values."""
         with self._lock:
-            self._ending.set()
+            self._stopping.set()
 
     def join(self, timeout: float) -> None:
         """Waits for the thread, which ends with the poller. Called after the end of all outputs."""
@@ -271,7 +271,7 @@ class TagValues:
             return all(each.settings.buffer.file != file for each in self._outputs.values())
 
         def is_followed() -> bool:
-            return name in self._outputs and not self._ending.is_set()
+            return name in self._outputs and not self._stopping.is_set()
 
         return Sending(
             name,
@@ -281,7 +281,7 @@ class TagValues:
             leaves,
             is_followed,
             # With `scan`, the next poll follows what was lost.
-            partial(self.renew, name) if output.settings.publish == "change" else bool,
+            partial(self.renew, name) if output.settings.publish == "change" else lambda _: None,
         )
 
     def find(self, device: str, tag: str) -> Tag | None:
@@ -318,7 +318,7 @@ class TagValues:
     def refresh(self, output: str) -> None:
         """Offers the last value of each tag to an output again. Thread-safe."""
         with self._lock:
-            if (known := self._outputs.get(output)) is not None and not self._ending.is_set():
+            if (known := self._outputs.get(output)) is not None and not self._stopping.is_set():
                 known.changes.forget(self._tagged)
                 known.offer(poll for poll, _ in self._latest.values())
 
@@ -347,27 +347,27 @@ class TagValues:
             self._heartbeat.beat()
             if not taken[0]:
                 continue
-            self._ending.wait(_GATHER_S)
+            self._stopping.wait(_GATHER_S)
             found = deque(taken[0])
             more = self.results.take(0.0)
             if more is not None:
                 found += more[0]
             self._handle(found)
-            if (lost := self.dropped - self._told) > 0:
-                self._told += lost
+            if (lost := self.dropped - self._reported_dropped) > 0:
+                self._reported_dropped += lost
                 log_lines.limited(logging.WARNING, "tag_polls_dropped", kind="", count=lost)
 
     def _handle(self, found: deque[Poll]) -> None:
-        while found and not self._ending.is_set():
+        while found and not self._stopping.is_set():
             self._heartbeat.beat()
             try:
                 with self._lock:
-                    if not self._ending.is_set():
+                    if not self._stopping.is_set():
                         self._offer(list(self._turn(found, time.monotonic() + _TURN_S)))
             except Exception:  # A fault in one poll must not end all outputs.
                 log_lines.problem("tag_values_failed")
             if found:
-                self._ending.wait(_TURN_S if _is_late(found[0]) else _YIELD_S)
+                self._stopping.wait(_TURN_S if _is_late(found[0]) else _YIELD_S)
 
     def _turn(self, found: deque[Poll], until: float) -> Iterator[DevicePoll]:
         """Takes and converts polls until a time, at least one."""

@@ -94,7 +94,7 @@ class Supervisor:
         self._thread = threading.Thread(target=self._run, name=f"holdfast-{name}", daemon=True)
         self._adapter: Adapter | None = None
         self._state = "stopped"
-        self._began = Heartbeat()
+        self._created = Heartbeat()
         self._has_ended = False
         self._restarts = 0
         self._last_error: str | None = None
@@ -126,7 +126,7 @@ class Supervisor:
             return None
         age = 0.0
         if not self._thread.is_alive():
-            age = self._began.age
+            age = self._created.age
         elif self._state == "running":
             own = getattr(self._adapter, "heartbeat", None)
             age = own.age if isinstance(own, Heartbeat) else 0.0

@@ -15,7 +15,7 @@ import click
 from holdfast._core import UnusableMemoryFile
 from holdfast.adapters.plugins import UnknownAdapter
 from holdfast.appliance import Appliance
-from holdfast.appliance.control import Control, is_run
+from holdfast.appliance.control import Control, is_running
 from holdfast.appliance.parts.shared_logs import LogNotJoined
 from holdfast.appliance.service_manager import ServiceManager
 from holdfast.cli.configuration import load_or_exit, load_whole
@@ -101,7 +101,7 @@ def serve(
     log_lines.configure(config.log.level, config.log.format)
     for warning in config.warnings:
         log_lines.write(logging.WARNING, "config_warning", warning=str(warning))
-    if file is not None and is_run(file):
+    if file is not None and is_running(file):
         _fail_as_run(file)
     lengthen_switch_interval()
     allow_open_files(config, file)
@@ -167,7 +167,7 @@ def _control(appliance: Appliance, reloading: Reloader, file: Path) -> Callable[
     try:
         return Control(file, handlers).close
     except OSError as error:
-        if is_run(file):
+        if is_running(file):
             _fail_as_run(file)
         log_lines.write(logging.WARNING, "control_unavailable", reason=str(error))
         return lambda: None
