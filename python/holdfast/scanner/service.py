@@ -283,7 +283,8 @@ class Scanner:
                 log_lines.write(logging.INFO, "shutdown_asked")
                 self.end()
 
-        # Who gets an answer may send anything: what is not answered is subscribed to before.
+        # First those without replies: a caller that gets a reply counts on all subjects, and a
+        # message to one that is not subscribed to yet is lost without an error.
         handlers = {
             f"{prefix}.shutdown": shutdown,
             f"{prefix}.scanner": self._presence.announced,

@@ -84,13 +84,13 @@ class FleetObserver:
         self._fleet = fleet
         self._servers = servers
         self._seen: dict[str, Entry] = {}
-        self._ending = AsyncExitStack()
+        self._exit_stack = AsyncExitStack()
 
     async def __aenter__(self) -> Self:
-        async with AsyncExitStack() as ending:
+        async with AsyncExitStack() as exit_stack:
             connecting = connected_once(self._servers, "holdfast fleet")
             began = time.monotonic()
-            self._client = await ending.enter_async_context(connecting)
+            self._client = await exit_stack.enter_async_context(connecting)
             left = began + ANSWERING - time.monotonic()
             bucket, is_read = LeaseBucket(self._client, leases_of(self._fleet)), asyncio.Event()
             try:
@@ -103,7 +103,7 @@ class FleetObserver:
                 raise FleetUnavailable(f"{self._where} does not answer") from None
             except (Error, OSError) as error:
                 raise FleetUnavailable(f"{self._where}: {nats_reason(error)}") from None
-            self._ending = ending.pop_all()
+            self._exit_stack = exit_stack.pop_all()
         return self
 
     async def __aexit__(
@@ -112,7 +112,7 @@ class FleetObserver:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        await self._ending.aclose()
+        await self._exit_stack.aclose()
 
     @property
     def _where(self) -> str:

@@ -48,7 +48,7 @@ class HeartbeatKey:
         self._revision: int | None = None
         """The revision of the own last heartbeat."""
         self._availability = Availability("heartbeat", "no_heartbeat", bucket=BUCKET, key=key)
-        self._has_checked_ttl = False
+        self._has_logged_missing_ttl = False
         self._stopped = False
 
     async def beat(self, client: Client | None) -> None:
@@ -91,9 +91,9 @@ class HeartbeatKey:
 
     async def _check_ttl(self, bucket: KeyValue) -> None:
         """Logs once if heartbeats in the bucket never expire."""
-        if self._has_checked_ttl or (await bucket.status()).ttl:
+        if self._has_logged_missing_ttl or (await bucket.status()).ttl:
             return
-        self._has_checked_ttl = True
+        self._has_logged_missing_ttl = True
         todo = (
             f"delete the bucket, so that it is created again, or set max_age {EXPIRES_AFTER_S:g} s"
         )

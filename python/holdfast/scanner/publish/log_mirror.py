@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 LEVELS = {logging.DEBUG: "debug", logging.INFO: "info", logging.WARNING: "warn"}
 """The words for levels; `error` for all others."""
 
-MAX_MESSAGE_BYTES = 4096
+MAX_MESSAGE_CHARS = 4096
 """The most characters of a published message."""
 
 
@@ -48,7 +48,7 @@ class LogMirror(logging.Handler):
         entry = LogEntry(
             timestamp=int(record.created * 1000),
             level=LEVELS.get(record.levelno, "error"),
-            message=text[:MAX_MESSAGE_BYTES],
+            message=text[:MAX_MESSAGE_CHARS],
             service_type="modbus",
             module_id=self._prefix,
             logger=f"{self._prefix}:scanner",
