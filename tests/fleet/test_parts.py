@@ -185,7 +185,7 @@ class Move:
         self.written: list[str] = []
         monkeypatch.setattr(nodes, "ask", self._ask)
         other = SimpleNamespace(node="b", process="")
-        fleet = SimpleNamespace(
+        partition_leases = SimpleNamespace(
             # No command waits for longer than this for a node.
             settings=FleetSettings("plant", "a", 16, LeaseTimes(3e-8, 2e-8, 1e-8)),
             leases=SimpleNamespace(seen={}),
@@ -193,7 +193,7 @@ class Move:
             is_other=lambda _: True,
         )
         member: Any = SimpleNamespace(
-            fleet=fleet,
+            partition_leases=partition_leases,
             client=object(),
             known=lambda device: device,
             is_own=lambda _: self.has_node and is_own,
