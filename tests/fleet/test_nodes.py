@@ -18,8 +18,8 @@ from nats.js.api import StreamConfig
 
 from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.net.nats.connection import Servers
+from holdfast.net.nats.key_bucket import Outdated
 from holdfast.net.nats.outbox import Outbox
-from holdfast.replication.leases.bucket import Outdated
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.scanner.errors import Refused
 from holdfast.scanner.fleet import desired_state, reports

@@ -63,7 +63,7 @@ def test_a_device_whose_lease_nobody_takes_in_time_is_not_polled(leases: _LogLea
     reason = "leases can't be taken: not connected"
     assert leases.unpolled() == {"meter": reason}
     assert leases.status()["meter"] == {"node": None, "polled_here": False, "reason": reason}
-    leases.leases.works(None)
+    leases.leases.set_reason(None)
     assert leases.unpolled() == {"meter": "no node takes its lease"}
     leases.obstacle = lambda _: "it has failed"
     assert leases.unpolled() == {"meter": "the log is not usable here: it has failed"}

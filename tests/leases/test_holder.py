@@ -12,13 +12,13 @@ import pytest
 from nats.errors import TimeoutError as NatsTimeout
 from nats.js.errors import ServiceUnavailableError
 
+from holdfast.net.nats.key_bucket import Outdated
 from holdfast.replication.leases import leases as module
 from holdfast.replication.leases.bucket import (
     SETTLED,
     Entry,
     Holding,
     LeaseBucket,
-    Outdated,
     entry,
 )
 from holdfast.replication.leases.leases import Leases
@@ -105,7 +105,7 @@ class Node:
     def changed(self) -> None:
         pass
 
-    def works(self, reason: str | None) -> None:
+    def availability_changed(self, reason: str | None) -> None:
         shown = "works" if reason is None else "is full"
         assert reason is None or "insufficient storage" in reason
         self.events.append(shown)

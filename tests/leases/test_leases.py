@@ -11,7 +11,8 @@ import pytest
 from nats.errors import TimeoutError as NatsTimeout
 
 from holdfast.net.nats.connection import Broker, Ping, Servers
-from holdfast.replication.leases.bucket import SETTLED, LeaseBucket, Outdated
+from holdfast.net.nats.key_bucket import Outdated
+from holdfast.replication.leases.bucket import SETTLED, LeaseBucket
 from holdfast.replication.leases.leases import Leases
 from holdfast.replication.leases.times import LeaseTimes
 from support import wire
@@ -61,7 +62,7 @@ class Node:
     def changed(self) -> None:
         pass
 
-    def works(self, reason: str | None) -> None:
+    def availability_changed(self, reason: str | None) -> None:
         self.events.append("works" if reason is None else f"fails: {reason}")
 
     def connected(self, client: Client | None) -> None:

@@ -70,7 +70,7 @@ class Node:
     def changed(self) -> None:
         pass
 
-    def works(self, reason: str | None) -> None:
+    def availability_changed(self, reason: str | None) -> None:
         pass
 
     def has(self, *keys: str) -> None:
@@ -278,7 +278,7 @@ def test_another_event_loop_is_told_in_order_and_of_many_changes_once() -> None:
         def changed(self) -> None:
             self.events.append("changed")
 
-        def works(self, reason: str | None) -> None:
+        def availability_changed(self, reason: str | None) -> None:
             self.events.append(f"works: {reason}")
 
     async def work() -> None:
@@ -287,7 +287,7 @@ def test_another_event_loop_is_told_in_order_and_of_many_changes_once() -> None:
         relay.attach(asyncio.get_running_loop())
 
         def tell() -> None:
-            relay.works(None)
+            relay.availability_changed(None)
             relay.changed()
             relay.taken("x")
             relay.changed()

@@ -18,6 +18,7 @@ from nats.errors import Error, NoRespondersError
 
 from holdfast.net import event_loop
 from holdfast.net.nats.connection import connected_once, nats_reason
+from holdfast.net.nats.jetstream_errors import NO_MESSAGE, STREAM_NOT_FOUND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine
@@ -32,16 +33,10 @@ if TYPE_CHECKING:
     T = TypeVar("T")
 
 VERSION = 1
-STREAM_NOT_FOUND = 10059
-"""The code of JetStream for a stream that does not exist."""
-
-NO_MESSAGE_FOUND = 10037
-"""The same for a message."""
-
 SNAPSHOT_KEY = "snapshot"
 """The key that names the snapshots."""
 
-USELESS = (
+UNUSABLE = (
     "no node could begin with the backup; try again when a node that runs has stored a new snapshot"
 )
 
@@ -81,7 +76,7 @@ class _NoMessage(BackupFailed):
     """The stream does not have the message."""
 
 
-_KINDS = {STREAM_NOT_FOUND: _NotFound, NO_MESSAGE_FOUND: _NoMessage}
+_KINDS = {STREAM_NOT_FOUND: _NotFound, NO_MESSAGE: _NoMessage}
 
 
 class _Snapshot(NamedTuple):
@@ -133,13 +128,15 @@ def restore(servers: Servers, log: str, replicas: int, folder: Path) -> int:
     """
     found = _checked(folder, log)
     _run(servers, lambda client: _refuse_existing(client, log))
-    begun: dict[str, bool] = {}
+    confirmed: dict[str, bool] = {}
     try:
-        return _run(servers, lambda client: _restore(client, log, replicas, folder, found, begun))
+        return _run(
+            servers, lambda client: _restore(client, log, replicas, folder, found, confirmed)
+        )
     except BaseException as error:
         # Over a new connection: what ends a command may also end the tasks of the old one.
         try:
-            left = _run(servers, lambda client: _clean_up(client, log, begun))
+            left = _run(servers, lambda client: _clean_up(client, log, confirmed))
         except BackupFailed as failure:
             left = f"What was restored could not be deleted, but no node begins with it: {failure}"
         if left is None:
@@ -216,12 +213,12 @@ async def _newest_snapshot(client: SafeClient, log: str) -> _Snapshot:
     keys, _, steps = streams(log)
     at, key = await _last(client, keys, f"$KV.{steps}.{SNAPSHOT_KEY}")
     if not key:
-        raise BackupFailed(f"{keys} has no key {SNAPSHOT_KEY}: {USELESS}")
+        raise BackupFailed(f"{keys} has no key {SNAPSHOT_KEY}: {UNUSABLE}")
     try:
         newest = json.loads(key)["newest"]
         return _Snapshot(at, int(newest["sequence"]), str(newest["object"]))
     except (ValueError, KeyError, TypeError) as error:
-        reason = f"{keys}: the key {SNAPSHOT_KEY} is {key[:100]!r}, not a snapshot: {USELESS}"
+        reason = f"{keys}: the key {SNAPSHOT_KEY} is {key[:100]!r}, not a snapshot: {UNUSABLE}"
         raise BackupFailed(reason) from error
 
 
@@ -254,7 +251,7 @@ async def _fetch_all(client: SafeClient, log: str, folder: Path) -> dict[str, di
     if missing is not None:
         if await _newest_snapshot(client, log) != newest:
             raise _Replaced(REPLACED)
-        raise BackupFailed(f"{missing}: {USELESS}")
+        raise BackupFailed(f"{missing}: {UNUSABLE}")
     return contents
 
 
@@ -374,30 +371,30 @@ async def _restore(
     replicas: int,
     folder: Path,
     contents: dict[str, Any],
-    begun: dict[str, bool],
+    confirmed: dict[str, bool],
 ) -> int:
-    """Adds to `begun` which streams the servers restore, and whether they have confirmed it."""
+    """Adds to `confirmed` the streams that the servers restore, and whether they have done so."""
     for name in reversed(streams(log)):
         config = contents[name]["config"] | {"num_replicas": replicas}
         request = {"config": config, "state": contents[name]["state"]}
         answer = await _ask(client, f"STREAM.RESTORE.{name}", request)
-        begun[name] = False
+        confirmed[name] = False
         await _send(client, name, answer["deliver_subject"], folder / name, contents[name])
-        begun[name] = True
+        confirmed[name] = True
     return int(contents[streams(log)[-1]]["state"]["messages"])
 
 
-async def _clean_up(client: SafeClient, log: str, begun: dict[str, bool]) -> str | None:
+async def _clean_up(client: SafeClient, log: str, confirmed: dict[str, bool]) -> str | None:
     """Deletes what was restored. Returns why not, if a node may use it."""
     # A node may have made a stream while it was restored, or gone on with those restored before.
-    others = [name for name in await _existing(client, log) if not begun.get(name)]
+    others = [name for name in await _existing(client, log) if not confirmed.get(name)]
     if others:
         return (
             f"A node seems to run, since the servers now have {', '.join(others)}; nothing was "
             "deleted. Stop all nodes. If one has gone on with the log, start them again; otherwise "
             "delete the streams of the log, for example with nats stream rm, and restore again"
         )
-    for name in reversed(begun):
+    for name in reversed(confirmed):
         # A cluster keeps the name of a stream whose restore was cut short, and makes it later.
         with contextlib.suppress(_NotFound):
             await _ask(client, f"STREAM.DELETE.{name}")

@@ -240,7 +240,7 @@ class _LogLeases:
                 logging.WARNING, "device_given_up", device=device, log=self.log, reason=reason
             )
 
-    def works(self, reason: str | None) -> None:
+    def availability_changed(self, reason: str | None) -> None:
         if reason is None:
             log_lines.write(logging.INFO, "leases_available", log=self.log)
         else:

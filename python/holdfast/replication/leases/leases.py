@@ -25,6 +25,7 @@ from nats.js.errors import APIError, NoStreamResponseError
 
 from holdfast import _core
 from holdfast.net.nats.connection import nats_reason
+from holdfast.net.nats.key_bucket import Outdated
 from holdfast.net.nats.tolerant_client import ServerError
 from holdfast.replication.leases.bucket import (
     SETTLED,
@@ -32,7 +33,6 @@ from holdfast.replication.leases.bucket import (
     Holding,
     LeaseBucket,
     NotALeaseBucket,
-    Outdated,
 )
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.runtime import tasks
@@ -75,7 +75,7 @@ class Watcher(Protocol):
     def changed(self) -> None:
         """Somebody else has taken or left a lease."""
 
-    def works(self, reason: str | None) -> None:
+    def availability_changed(self, reason: str | None) -> None:
         """The bucket works; or it does not, for this reason."""
 
 
@@ -129,12 +129,15 @@ class Leases:
         self._held: dict[str, _Held] = {}
         self._wanted: frozenset[str] = frozenset()
         self._taking: set[str] = set()
-        self._ending: set[str] = set()
+        self._returning_keys: set[str] = set()
+        """Those that are being given back."""
         self._client: Client | None = None
         self._bucket: LeaseBucket | None = None
         self.reason: str | None = "not connected"
         """Why the bucket does not work; `None` if it does."""
-        self._is_opening = self._is_checked = self._is_settling = False
+        self._is_opening = self._is_settling = False
+        self._is_followed = False
+        """Whether the keys of the bucket are followed over this connection, as far as is known."""
         self._refusal: Exception | None = None
         """Why the last write was refused, if it may still be so."""
         self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
@@ -151,7 +154,7 @@ class Leases:
             self._refusal = None  # Permissions may have changed.
         if client is not None and self._bucket is not None and self._bucket.client is not client:
             self._bucket = None
-        self._is_checked = False  # The server may have forgotten who follows, or what is stored.
+        self._is_followed = False  # The server may have forgotten who follows, or what is stored.
         self._news.set()
 
     def fence(self, key: str) -> _core.Fence:
@@ -236,7 +239,7 @@ class Leases:
         if held is None:
             return True
         fence = self._fences[key]
-        self._ending.add(key)
+        self._returning_keys.add(key)
         try:
             fence.end()
             until = time.monotonic() + limit
@@ -253,7 +256,7 @@ class Leases:
                         await self._bucket.delete(key, held.revision)
             return is_clean
         finally:
-            self._ending.discard(key)
+            self._returning_keys.discard(key)
             self._watcher.changed()
 
     async def give_all_back(self, limit: float) -> None:
@@ -278,8 +281,8 @@ class Leases:
         if self._bucket is not None and now - self._heard > silence_s:
             is_missing = any(key not in self._held for key in self._wanted)
             if is_missing or now - self._acknowledged < silence_s:
-                self._is_checked = False
-        if not self._is_checked:
+                self._is_followed = False
+        if not self._is_followed:
             self._is_opening = True
             self._begin(self._open(self._client))
 
@@ -291,7 +294,7 @@ class Leases:
             self._identify(created, last_revision)
             await bucket.follow(self._saw, self._note_read)
         except (Error, OSError, NotALeaseBucket) as error:
-            self.works(nats_reason(error))
+            self.set_reason(nats_reason(error))
             await asyncio.sleep(self._backoff.failed())
             return
         finally:
@@ -301,11 +304,11 @@ class Leases:
                 await bucket.unfollow()
             return
         self._bucket = bucket
-        self._is_checked = True
+        self._is_followed = True
         self._heard = time.monotonic()
         self._backoff.succeeded()
         if self._refusal is None:
-            self.works(None)
+            self.set_reason(None)
         self._news.set()
 
     def _identify(self, created: datetime | None, last_revision: int) -> None:
@@ -324,23 +327,23 @@ class Leases:
     def _note_read(self) -> None:
         self.is_read = True
 
-    def works(self, reason: str | None) -> None:
+    def set_reason(self, reason: str | None) -> None:
         """Sets why the bucket does not work; `None` if it does."""
         if reason != self.reason:
             self.reason = reason
-            self._watcher.works(reason)
+            self._watcher.availability_changed(reason)
 
     def _note_failure(self, error: Exception) -> None:
         """Reports that the server refuses writes. A missing answer is not a refusal."""
         if isinstance(error, (APIError, ServerError)):
             self._refusal = error
-            self.works(nats_reason(error))
+            self.set_reason(nats_reason(error))
 
     def _note_write(self) -> None:
         """Notes that a write of this or another node was accepted."""
         if self._refusal is not None:
             self._refusal = None
-            self.works(None)
+            self.set_reason(None)
 
     def _saw(self, key: str, entry: Entry) -> None:
         self._heard = time.monotonic()
@@ -364,7 +367,7 @@ class Leases:
         return all(each is not None and each.process != self.process for each in holders)
 
     def _take_free(self, now: float) -> None:
-        if self._bucket is None or not self._is_checked or not self.is_read:
+        if self._bucket is None or not self._is_followed or not self.is_read:
             return
         if SETTLED not in self.seen:
             if now >= self.may_settle_at and not self._is_settling:
@@ -372,7 +375,7 @@ class Leases:
                 self._begin(self._settle(self._bucket))
             return
         for key in self._wanted:
-            if key in self._held or key in self._taking or key in self._ending:
+            if key in self._held or key in self._taking or key in self._returning_keys:
                 continue
             entry = self.seen.get(key)
             if entry is None or not entry.is_live(now, self.times) or self._is_own(entry):
@@ -422,7 +425,7 @@ class Leases:
             await self._read(bucket, key)
             return
         except NoStreamResponseError:
-            self._is_checked = False  # It is made again.
+            self._is_followed = False  # It is made again.
             return
         except (Error, OSError) as error:
             self._note_failure(error)

@@ -51,7 +51,7 @@ class LeaseThread:
         self._heartbeat = Heartbeat()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stopping = asyncio.Event()
-        self._ending = 0.0
+        self._stop_limit_s = 0.0
         self._thread: threading.Thread | None = None
         self._tasks: set[asyncio.Task[bool]] = set()
 
@@ -67,7 +67,7 @@ class LeaseThread:
         Blocks until then.
         """
         if self._thread is not None:
-            self._ending = limit
+            self._stop_limit_s = limit
             self._soon(self._stopping.set)
             self._thread.join()
 
@@ -127,7 +127,7 @@ class LeaseThread:
         async with tasks.beating(self._heartbeat):
             await self._stopping.wait()
             self._leases.want(())
-            await self._leases.give_all_back(self._ending)
+            await self._leases.give_all_back(self._stop_limit_s)
             await tasks.end(running)
 
     async def _keep_connected(self) -> None:
@@ -135,10 +135,10 @@ class LeaseThread:
             try:
                 await self._connect(self._leases.connected)
             except OSError as error:  # A file that can't be used.
-                self._leases.works(str(error))
+                self._leases.set_reason(str(error))
             except Exception as error:
                 log_lines.problem("leases_failed", bucket=self._leases.bucket)
-                self._leases.works(repr(error))
+                self._leases.set_reason(repr(error))
             await asyncio.sleep(self._retry_s)
 
     async def _keep(self) -> None:
@@ -177,9 +177,9 @@ class Relay:
             self._has_changed = True
             self._soon(self._pass_on_change)
 
-    def works(self, reason: str | None) -> None:
+    def availability_changed(self, reason: str | None) -> None:
         """The bucket works; or it does not, for this reason."""
-        self._soon(self._watcher.works, reason)
+        self._soon(self._watcher.availability_changed, reason)
 
     def _pass_on_change(self) -> None:
         self._has_changed = False

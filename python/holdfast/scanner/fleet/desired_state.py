@@ -15,7 +15,7 @@ from nats.errors import Error
 
 from holdfast.config.values.scanner_settings import WANTS
 from holdfast.events import log_lines
-from holdfast.replication.leases.bucket import KeyBucket, Outdated
+from holdfast.net.nats.key_bucket import OPERATION_HEADER, KeyBucket, Outdated
 from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms
 
@@ -320,7 +320,7 @@ class DesiredState:
         assert self._bucket is not None, "it is open"
         headers = dict(more or {})
         if not value:
-            headers |= {"KV-Operation": "DEL", "Nats-TTL": f"{DELETION_TTL_S}s"}
+            headers |= {OPERATION_HEADER: "DEL", "Nats-TTL": f"{DELETION_TTL_S}s"}
         return await self._bucket.publish(key, value, revision, headers)
 
 

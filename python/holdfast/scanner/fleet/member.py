@@ -19,7 +19,7 @@ from nats.js.errors import NoStreamResponseError
 from holdfast.client.url import connection_of
 from holdfast.events import log_lines
 from holdfast.net.nats.connection import nats_reason
-from holdfast.replication.leases.bucket import Outdated
+from holdfast.net.nats.key_bucket import Outdated
 from holdfast.replication.leases.leases import FIRST_RETRY_S, MAX_RETRY_S
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff

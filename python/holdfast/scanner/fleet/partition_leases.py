@@ -314,7 +314,7 @@ class PartitionLeases:
         """Somebody else has taken or left a lease."""
         self._has_changed.set()
 
-    def works(self, reason: str | None) -> None:
+    def availability_changed(self, reason: str | None) -> None:
         """The bucket of leases works; or it does not, for this reason."""
         if reason is None:
             log_lines.write(logging.INFO, "leases_available", fleet=self.settings.name)

@@ -2,6 +2,9 @@
 
 It starts again with all keys after each connection, after an error of JetStream, and when it has
 missed a change. A missing bucket is created. A key that a lost bucket had is not a deleted one.
+
+It is for buckets that other programs write, and waits until changes have settled. Nodes that change
+keys together follow them with `net.nats.key_bucket`, which passes on each message at once.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
 from holdfast.events import log_lines
+from holdfast.net.nats.key_bucket import MARKER_HEADERS
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
 from holdfast.scanner.jetstream.availability import (
@@ -44,9 +48,6 @@ MAX_FIRST_READ_WAIT_S = 2.0
 
 MAX_SETTLE_S = 2.0
 """Time after which changes are reported, even if further ones follow."""
-
-MARKER_HEADERS = ("KV-Operation", "Nats-Marker-Reason")
-"""The headers of messages that stand for deleted or expired keys."""
 
 
 @dataclass(frozen=True)
