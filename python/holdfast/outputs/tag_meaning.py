@@ -16,7 +16,7 @@ def meaning_of(tag: Tag) -> int:
 
 
 def described(tag: Tag) -> str:
-    """The same and the area, as text for `tag_from`."""
+    """The same as text, and the area: `tag_from` makes a tag of it."""
     scale: object = tag.scale
     if isinstance(scale, RegisterScale):
         scale = scale.form, scale.name or scale.where
