@@ -133,6 +133,31 @@ def test_a_connection_that_may_have_late_replies_is_not_pushed_out(
     assert asyncio.run(asyncio.wait_for(run(), wire.DEADLINE)) == ("busy" if may_come else [7])
 
 
+def test_connections_may_be_pushed_out_while_an_idle_one_is_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And idle ones are closed later too, although that one could not be closed."""
+    monkeypatch.setattr(pool, "CHECK_INTERVAL_S", 0)
+    slow, *others = (NetworkTarget("tcp", f"127.0.0.{number}", 502) for number in range(1, 5))
+
+    async def run() -> None:
+        transports = {target: Failing([7]) for target in (slow, *others)}
+        for target in others:
+            transports[target].is_closing.set()
+        pool = Pool(most=2, in_flight=1, idle=0, dial=lambda target, _: transports[target])
+        idle, *new = others
+        await ask(pool, slow)
+        await ask(pool, idle)
+        await transports[slow].is_closing.wait()
+        for target in new:
+            await ask(pool, target)
+        transports[slow].may_fail.set()
+        while len(pool):
+            await asyncio.sleep(0)
+
+    asyncio.run(asyncio.wait_for(run(), wire.DEADLINE))
+
+
 class Unstoppable(Failing):
     """Answers when it may, also after it was cancelled."""
 

@@ -340,7 +340,8 @@ class Pool:
         if self._shared is not None:
             self._shared.forget_unused(latest)
         for key, entry in list(self._entries.items()):
-            if entry.users or entry.in_flight:
+            # While the one before was closed, a request may have pushed this one out.
+            if self._entries.get(key) is not entry or entry.users or entry.in_flight:
                 continue
             if _is_needed(entry) and not self._is_shared(key):
                 if entry.doubtful:
@@ -348,7 +349,8 @@ class Pool:
                     self._start(entry, close=True)
             elif entry.doubtful or entry.used < latest or self._is_shared(key):
                 del self._entries[key]
-                await entry.transport.close()
+                with contextlib.suppress(Exception):
+                    await entry.transport.close()
 
     def _is_shared(self, key: NetworkTarget) -> bool:
         """Returns whether the appliance has begun to use the device, which may accept no more."""
