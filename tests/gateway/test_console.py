@@ -360,6 +360,25 @@ def test_a_plot_is_chosen_and_removed(opened: Opened) -> None:
     expect(view.button("Remove the plot of 102")).to_be_visible()
 
 
+def test_a_chosen_plot_replaces_those_of_values_that_have_changed_since_they_were_read(
+    opened: Opened, plant: holdfast.Memory
+) -> None:
+    view = opened()
+    view.connect()
+    view.choose(type="uint16", quantity="8", interval="50")
+    view.button("Read").click()
+    view.says("Holding registers 0 to 7: read in")
+    plant.write("holding_registers", 4, [4711, 4712])
+    for _ in "read", "watched before":
+        view.button("Plot 4").click()
+        view.says("Watching holding registers 0 to 7")
+        plots = view.page.get_by_role("article").get_by_role("heading")
+        expect(plots).to_have_text(["4"])
+        view.button("Stop").click()
+        view.says("Stopped.")
+        plant.write("holding_registers", 4, [4713, 4714])
+
+
 @both
 def test_a_map_is_a_picture_whose_ranges_can_be_read(
     opened: Opened, size: Any, scheme: Literal["light", "dark"]

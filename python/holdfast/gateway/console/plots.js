@@ -76,17 +76,23 @@ export class Plots {
 
   wishKey(key) {
     if (this.shown.has(key)) this.told.textContent = `${this.shown.get(key).label} is already plotted.`;
-    else this.choose(key);
+    else this.toggle(key);
   }
 
   /** Adds the plot of a value, or removes it. */
-  choose(key) {
+  toggle(key) {
     this.told.textContent = "";
     if (this.shown.has(key)) this.remove(key);
     else if (this.shown.size < MAX_PLOTS) this.add(key);
     else this.told.textContent = `There can be at most ${MAX_PLOTS} plots. Remove one first.`;
     this.chosen = true;
     this.onChoice();
+  }
+
+  /** Shows plots that the user chose earlier, instead of the automatic ones. */
+  restore(keys) {
+    this.shown.forEach((_, key) => this.remove(key));
+    keys.forEach((key) => this.toggle(key));
   }
 
   /** Handles a changed value. Until the user chooses plots, the first values that change get one. */
@@ -126,7 +132,7 @@ export class Plots {
     const panel = this.panels[Number(key.slice(0, dot))];
     const cell = panel?.cells().find((each) => String(each) === key.slice(dot + 1));
     if (cell === undefined) return;
-    const plot = new Plot(this, panel, cell, panel.label(cell, this.panels.length === 1), () => this.choose(key));
+    const plot = new Plot(this, panel, cell, panel.label(cell, this.panels.length === 1), () => this.toggle(key));
     this.shown.set(key, plot);
     this.place.append(plot.root);
     plot.take(this.latest);

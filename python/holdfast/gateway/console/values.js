@@ -335,7 +335,7 @@ export class Values {
       if (!$("interval").reportValidity()) return;
       this.watch(this.wholes, [key]);
     } else if (this.plots) {
-      this.plots.choose(key);
+      this.plots.toggle(key);
     }
   }
 
@@ -416,7 +416,7 @@ export class Values {
       this.report(data.parts.map(() => null), true);
     }
     this.take(data, true);
-    if (first) this.plotted?.forEach((key) => this.plots.choose(key));
+    if (first && this.plotted?.length > 0) this.plots.restore(this.plotted);
   }
 
   /** Returns whether the tables have the tags of an event. */
