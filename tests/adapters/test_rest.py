@@ -528,7 +528,7 @@ def test_a_fault_is_answered_without_a_detail_and_logged(log: web.Records) -> No
             assert answer.json == {
                 "status": "failed",
                 "reason": "internal_error",
-                "detail": "see the log",
+                "detail": "internal error, see the log",
             }
     assert [entry["event"] for entry in log.fields] == ["request_failed"] * 2
 

@@ -116,6 +116,14 @@ def test_the_log_says_why_a_connection_can_not_be_accepted(
     assert "Too many open files" in str(faults[0]["error"])
 
 
+def test_a_failed_request_has_an_answer_of_the_service(
+    address: tuple[str, int],
+) -> None:
+    with closing(web.Client(address)) as client:
+        answer = client.get("/fail")
+    assert (answer.status, answer.body) == (500, b"internal_error: internal error, see the log")
+
+
 class Reader:
     """A handler that reads a body, and notes its path and the round of the event loop."""
 
@@ -129,6 +137,8 @@ class Reader:
     def __call__(self, request: Request) -> Response | Coroutine[Any, Any, Response]:
         self._counting = self._counting or asyncio.create_task(self._count())
         self.begun.append(request.path)
+        if request.path == "/fail":
+            raise RuntimeError
         if request.path == "/block":
             self.resume.wait(wire.DEADLINE)
             return Response(200)
@@ -169,6 +179,7 @@ def address(reader: Reader) -> Iterator[tuple[str, int]]:
             limits=limits,
             request_timeout=wire.DEADLINE,
             stop_timeout=0,
+            rejection=lambda status, reason, text: Response(status, f"{reason}: {text}".encode()),
         )
         with web.in_a_thread(server):
             yield listener.getsockname()

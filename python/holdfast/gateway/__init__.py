@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from holdfast import __version__
 from holdfast.client.client import connection
-from holdfast.gateway.app import App, rejection
+from holdfast.gateway.app import App, gateway_rejection
 from holdfast.gateway.operations import document, operations
 from holdfast.gateway.settings import GatewayLimits, Settings
 from holdfast.net.allow_list import AllowedNetwork
@@ -69,7 +69,7 @@ class Gateway:
             ),
             request_timeout=settings.limits.request_timeout,
             leaving=True,
-            rejection=rejection,
+            rejection=gateway_rejection,
             https=https,
         )
         self.heartbeat = self._server.heartbeat

@@ -174,9 +174,9 @@ class App(Application):
             return self._refused_by(request, error)
         if isinstance(error, Failed):
             self._failed += 1
-            return rejection(FAILURE.status, error.reason, error.detail, *error.headers)
+            return gateway_rejection(FAILURE.status, error.reason, error.detail, *error.headers)
         log_lines.problem("request_failed", listener="gateway", peer=request.peer)
-        return rejection(FAILURE.status, "internal_error", "internal error, see the log")
+        return gateway_rejection(FAILURE.status, "internal_error", "internal error, see the log")
 
     def _refused_by(self, request: Request, error: BadRequest) -> Response:
         self._refused[error.reason] = self._refused.get(error.reason, 0) + 1
@@ -191,7 +191,7 @@ class App(Application):
             detail="-" if error.reason == "malformed" else error.detail,
         )
         status = REFUSALS.status(error.reason)
-        answer = rejection(status, error.reason, error.detail, *error.headers)
+        answer = gateway_rejection(status, error.reason, error.detail, *error.headers)
         if isinstance(error, port_of_call.Rejected):
             answer.body, answer.status = error.body, error.status
         return answer
@@ -474,7 +474,9 @@ def host_of(peer: str) -> str:
     return peer.rpartition(":")[0]
 
 
-def rejection(status: int, reason: str, detail: str, *more: tuple[bytes, bytes]) -> Response:
+def gateway_rejection(
+    status: int, reason: str, detail: str, *more: tuple[bytes, bytes]
+) -> Response:
     """Returns the response to a refused or failed request."""
     said = {"success": False, "error": detail}
     return json_response(said, (REASON, reason.encode()), *more, status=status)

@@ -95,8 +95,9 @@ def _headers(kind: bytes, more: tuple[tuple[bytes, bytes], ...]) -> Sequence[tup
     return ((b"content-type", kind), *SAFE, *more)
 
 
-def rejection(status: int, reason: str, detail: str, word: str = "rejected") -> Response:
-    """Returns the refusal of a request, in JSON."""
+def rejection(status: int, reason: str, detail: str) -> Response:
+    """Returns the refusal of a request, or its failure (500), in JSON."""
+    word = "failed" if status == 500 else "rejected"
     body = msgspec.json.encode({"status": word, "reason": reason, "detail": detail})
     return response(JSON, body, status=status)
 

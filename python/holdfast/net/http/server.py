@@ -89,8 +89,8 @@ class WebServer:
     A handler that waits for a body that does not arrive in time gets `BadRequest`. It then has a
     second to answer before the connection is dropped.
 
-    `rejection` creates the response to requests that never reach the handler, from the status, the
-    reason and a sentence.
+    `rejection` creates the response to requests that never reach the handler, or whose handler
+    fails, from the status, the reason and a sentence.
 
     With `https`, connections use TLS. `request_timeout` includes the handshake; connections in it
     have as many places of their own as `limits` gives to all.
@@ -304,7 +304,7 @@ class WebServer:
             answer.closes = True
             return answer
         log_lines.problem("request_failed", listener=self.name, peer=request.peer)
-        return rejection(500, "internal_error", "see the log", "failed")
+        return self.rejection(500, "internal_error", "internal error, see the log")
 
     def _respond(self, request: _ServerRequest, answer: Response) -> None:
         exchange = request.exchange
