@@ -26,7 +26,7 @@ from holdfast.gateway.endpoints.request_tags import SHORT_SIZE
 from holdfast.gateway.pool import Pool
 from holdfast.gateway.refusals import EXCEPTION_STATUS, FAILURE, REFUSALS
 from holdfast.gateway.repeated_writes import RepeatedWrites
-from holdfast.gateway.shared_devices import Shared
+from holdfast.gateway.shared_devices import ApplianceLinks
 from holdfast.gateway.streams import views, watch
 from holdfast.gateway.write_outcome import outcome
 from holdfast.net.allow_list import AllowList
@@ -108,7 +108,7 @@ class App(Application):
             idle=limits.idle,
             tls=settings.tls,
             dial=dial,
-            shared=None if poller is None else Shared(poller),
+            shared=None if poller is None else ApplianceLinks(poller),
         )
         self._repeated = RepeatedWrites()
         self._active: Counter[object] = Counter()
@@ -117,7 +117,7 @@ class App(Application):
         self._parsing = tasks.Places(1)
         """Whose requests are parsed, by address of the client and whether they are long."""
         self._requests = self._failed = self._writes = 0
-        self._refused: dict[str, int] = {}
+        self._refusal_counts: Counter[str] = Counter()
         self._ending = asyncio.Event()
         self._cancels: dict[Callable[[], None], float] = {}
         """What cancels the pending requests, and how many seconds after a stop."""
@@ -132,7 +132,7 @@ class App(Application):
         """
         return {
             "requests": self._requests,
-            "refused": dict(self._refused),
+            "refused": dict(self._refusal_counts),
             "failed": self._failed,
             "writes": self._writes,
             "devices": len(self._pool),
@@ -166,20 +166,20 @@ class App(Application):
             return port_of_call.METHOD_NOT_ALLOWED
         return f"{port_of_call.METHOD_NOT_ALLOWED}; allowed: {operation.methods}"
 
-    def refused(self, request: Request, error: Exception) -> Response:
+    def error_response(self, request: Request, error: Exception) -> Response:
         """Returns the response to a request that was refused or has failed."""
         if isinstance(error, BrokenBody | ClientDisconnected):
             raise error
         if isinstance(error, BadRequest):
-            return self._refused_by(request, error)
+            return self._refusal_response(request, error)
         if isinstance(error, Failed):
             self._failed += 1
             return gateway_rejection(FAILURE.status, error.reason, error.detail, *error.headers)
         log_lines.problem("request_failed", listener="gateway", peer=request.peer)
         return gateway_rejection(FAILURE.status, "internal_error", "internal error, see the log")
 
-    def _refused_by(self, request: Request, error: BadRequest) -> Response:
-        self._refused[error.reason] = self._refused.get(error.reason, 0) + 1
+    def _refusal_response(self, request: Request, error: BadRequest) -> Response:
+        self._refusal_counts[error.reason] += 1
         log_lines.refused(
             "gateway_refused",
             kind=error.reason,
@@ -251,17 +251,19 @@ class App(Application):
 
     # Requests to devices.
 
-    async def carry_out(self, request: Request, endpoint: Endpoint, given: Given) -> Response:
+    async def handle_device_request(
+        self, request: Request, endpoint: Endpoint, given: Given
+    ) -> Response:
         """Carries out one operation on a device."""
         is_write = endpoint.writes(given)
         try:
-            return await self._carry_out(request, endpoint, given, is_write)
+            return await self._within_limits(request, endpoint, given, is_write)
         except BadRequest as refusal:
             if is_write:
-                self._repeated.tell(request, refusal)
+                self._repeated.add_maybe_written_header(request, refusal)
             raise
 
-    async def _carry_out(
+    async def _within_limits(
         self, request: Request, endpoint: Endpoint, given: Given, is_write: bool
     ) -> Response:
         with self._request():
@@ -270,7 +272,7 @@ class App(Application):
             device = RequestedDevice(self._routes, self._pool, given, broadcast=endpoint.broadcast)
             with self._request_to(device):
                 reply = partial(self._reply, request, endpoint, given, device, is_write)
-                work = self._repeated.carry_out(request, device, reply) if is_write else reply()
+                work = self._repeated.write_once(request, device, reply) if is_write else reply()
                 try:
                     return await self._until_disconnect(request, work, grace=self._limits.ending)
                 except ClientDisconnected:
@@ -296,7 +298,7 @@ class App(Application):
     ) -> Response:
         """Returns what the device replies."""
         try:
-            reply = await endpoint.carry_out(given, device)
+            reply = await endpoint.execute(given, device)
         except BaseException as error:
             ended = outcome(device, error)
             if is_write:
@@ -344,12 +346,14 @@ class App(Application):
 
     async def map(self, request: Request, given: Given) -> None:
         """Maps a device."""
+        most = given["maxStreams"]
+        if self._has_streams(request, most):
+            raise BadRequest("busy", f"streams of this address: {most}, which is maxStreams")
         with self._stream(request):
-            self._require_stream(request, given["maxStreams"])
             device = RequestedDevice(self._routes, self._pool, given)
             longest = self._limits.discovery
             await self._while_streaming(
-                request, lambda stream: address_map.survey(given, device, stream, longest)
+                request, lambda stream: address_map.map_device(given, device, stream, longest)
             )
 
     async def watch(self, request: Request, given: Given) -> None:
@@ -367,7 +371,7 @@ class App(Application):
         """Follows several ranges and tag lists of a device."""
         parts = await self._parsed(request, views.parts_of, given)
         device = RequestedDevice(self._routes, self._pool, given)
-        streaming = not given["once"] and self._has_stream(request, given["maxStreams"])
+        streaming = not given["once"] and self._may_stream(request, given["maxStreams"])
         with contextlib.ExitStack() as places:
             if streaming:
                 places.enter_context(self._stream(request))
@@ -386,17 +390,14 @@ class App(Application):
         with self._place("streams", self._limits.streams, "streams"), of_client:
             yield
 
-    def _has_stream(self, request: Request, most: int | None) -> bool:
+    def _may_stream(self, request: Request, most: int | None) -> bool:
         """Whether a client that asks for at most `most` streams can have one more."""
-        if most is None:
-            return True
-        full = self._active["streams"] >= self._limits.streams
-        return not full and self._active[host_of(request.peer)] < most
+        is_full = self._active["streams"] >= self._limits.streams
+        return most is None or not (is_full or self._has_streams(request, most))
 
-    def _require_stream(self, request: Request, most: int | None) -> None:
-        """Raises `BadRequest` if the client has more than `most` streams, with the newest."""
-        if most is not None and self._active[host_of(request.peer)] > most:
-            raise BadRequest("busy", f"streams of this address: {most}, which is maxStreams")
+    def _has_streams(self, request: Request, most: int | None) -> bool:
+        """Whether the client's address has `most` streams or more."""
+        return most is not None and self._active[host_of(request.peer)] >= most
 
     async def _while_streaming(
         self, request: Request, work: Callable[[Stream], Coroutine[Any, Any, None]]

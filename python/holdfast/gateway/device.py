@@ -178,7 +178,7 @@ def exception_text(error: ModbusException) -> str:
     return f"Modbus exception: {exception_name(error)} (code 0x{error.code:x})"
 
 
-def problem(error: ModbusException | Failed | BadRequest) -> dict[str, Any]:
+def error_fields(error: ModbusException | Failed | BadRequest) -> dict[str, Any]:
     """Returns the fields for an error in events of a stream."""
     if isinstance(error, ModbusException):
         return {"reason": "exception", "error": exception_text(error), "code": error.code}

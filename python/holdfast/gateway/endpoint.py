@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     Given: TypeAlias = Mapping[str, Any]
     Answer: TypeAlias = dict[str, Any]
 
-TARGET: tuple[Field, ...] = (HOST, PORT, UNIT, TRANSPORT, SERVER_NAME)
+TARGET_FIELDS: tuple[Field, ...] = (HOST, PORT, UNIT, TRANSPORT, SERVER_NAME)
 """The fields that name a device."""
 
 EXAMPLE: dict[str, Any] = {"host": "plc.factory.local", "port": 502, "unitId": 1}
@@ -59,7 +59,7 @@ class Endpoint:
     summary: str
     description: str
     fields: tuple[Field, ...] = ()
-    carry_out: Callable[[Given, RequestedDevice], Awaitable[Answer]]
+    execute: Callable[[Given, RequestedDevice], Awaitable[Answer]]
     properties: dict[str, Schema]
     """The schemas of the answer's fields."""
     optional: tuple[str, ...] = ()

@@ -18,7 +18,7 @@ REGISTER = integer(0, MAX_WORD)
 ADDRESS_SCHEMA = integer(0, LAST_ADDRESS)
 UNIT_SCHEMA = integer(0, MAX_UNIT)
 BIT: Schema = {"enum": [False, True, 0, 1]}
-TYPED_SCHEMA: Schema = {"type": ["integer", "number", "string", "boolean"]}
+TYPED_VALUE_SCHEMA: Schema = {"type": ["integer", "number", "string", "boolean"]}
 """A value of the type that `datatype` names."""
 TYPE_NAME_SCHEMA: Schema = {"type": "string", "minLength": 1, "maxLength": 32}
 ORDER: Schema = {"type": "string", "pattern": "^([A-D]{4}|[A-H]{8})$"}
@@ -92,6 +92,11 @@ def check_end(address: int, count: int) -> None:
     """Raises `BadRequest` for a range that goes beyond the last address."""
     if address + count > ADDRESSES:
         raise malformed(f"{count} from address {address}: the last address is {LAST_ADDRESS}")
+
+
+def max_streams(text: str) -> Field:
+    """The field for the most streams of the client's address."""
+    return Field("maxStreams", integer(1, 64), text, None)
 
 
 def timeout(default: int, longest: int, text: str = "Timeout of the request in ms") -> Field:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast.gateway import assets, port_of_call, write_outcome
 from holdfast.gateway.app import App
-from holdfast.gateway.endpoint import EXAMPLE, TARGET, never
+from holdfast.gateway.endpoint import EXAMPLE, TARGET_FIELDS, never
 from holdfast.gateway.endpoints import (
     address_map,
     diagnostics,
@@ -20,8 +20,7 @@ from holdfast.gateway.endpoints import (
 from holdfast.gateway.fields import timeout
 from holdfast.gateway.refusals import DEVICE, FAILURE, REFUSALS, WRITE
 from holdfast.gateway.repeated_writes import KEY
-from holdfast.gateway.schemas import SCHEMAS
-from holdfast.gateway.schemas import TARGET as TARGET_SCHEMAS
+from holdfast.gateway.schemas import SCHEMAS, TARGET_SCHEMAS
 from holdfast.gateway.streams import views, watch
 from holdfast.net.http import health, openapi
 from holdfast.net.http.application import DOCUMENTS
@@ -59,7 +58,7 @@ def operations(settings: Settings) -> tuple[Operation[App], ...]:
 
 def _of_device(endpoint: Endpoint, settings: Settings) -> Operation[App]:
     longest = round(1000 * settings.limits.timeout)
-    fields = (*TARGET, *endpoint.fields, timeout(min(endpoint.timeout_ms, longest), longest))
+    fields = (*TARGET_FIELDS, *endpoint.fields, timeout(min(endpoint.timeout_ms, longest), longest))
     answer = {"success": {"const": True}, **TARGET_SCHEMAS, **endpoint.properties}
     example = {"success": True, **EXAMPLE, **endpoint.answer}
     if endpoint.has_rtt:
@@ -74,7 +73,7 @@ def _of_device(endpoint: Endpoint, settings: Settings) -> Operation[App]:
         endpoint.path,
         endpoint.name,
         endpoint.summary,
-        lambda app, request, given: app.carry_out(request, endpoint, given),
+        lambda app, request, given: app.handle_device_request(request, endpoint, given),
         json_answer("The device responded", {"oneOf": [whole, ref("ModbusException")]}, example),
         DEVICE if endpoint.writes is never else (*DEVICE, *WRITE),
         endpoint.description,
@@ -179,7 +178,7 @@ def document(version: str, settings: Settings) -> dict[str, Any]:
         f"sending and receiving. A body has at most {settings.limits.body} bytes.",
         SCHEMAS,
         REFUSALS,
-        _refused,
+        _openapi_refusal,
     )
     made = openapi.document(api, version, operations(settings), secured=bool(settings.tokens))
     if settings.compat == "port-of-call":
@@ -187,7 +186,7 @@ def document(version: str, settings: Settings) -> dict[str, Any]:
     return made
 
 
-def _refused(row: Refusal) -> dict[str, Any]:
+def _openapi_refusal(row: Refusal) -> dict[str, Any]:
     """The response to a refused or failed request."""
     said = json_answer(row.means, ref("Error"), {"success": False, "error": row.example})
     reason = {"schema": {"enum": list(row.reasons)}, "description": "The reason as a word"}

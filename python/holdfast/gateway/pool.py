@@ -22,7 +22,7 @@ from holdfast.client.client import connection
 from holdfast.client.endpoint import check_files
 from holdfast.client.url import IN_FLIGHT, NetworkTarget
 from holdfast.errors import ConnectionLost, ModbusException, RequestTimeout
-from holdfast.gateway.broadcast import is_broadcast, send
+from holdfast.gateway import broadcast
 from holdfast.gateway.shared_devices import Elsewhere, Turns
 from holdfast.gateway.shared_reads import WaitingRequests
 from holdfast.net.http.requests import BadRequest
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from holdfast._core import Request
     from holdfast.client.async_transports import OwnTransport
     from holdfast.gateway.device_routes import Route
-    from holdfast.gateway.shared_devices import Shared
+    from holdfast.gateway.shared_devices import ApplianceLinks
     from holdfast.net.tls import Tls
 
 Result = TypeVar("Result")
@@ -65,15 +65,15 @@ class _Device:
     users: int = 0
     """The number of calls that use the connection or wait for it."""
     used: float = field(default_factory=time.monotonic)
-    doubtful: bool = False
+    is_state_unknown: bool = False
     """Whether the last request had no response."""
-    needed: float = -inf
+    late_replies_until: float = -inf
     """Until then, late replies may come that only this client knows."""
 
 
-def _is_needed(device: _Device) -> bool:
+def _expects_late_replies(device: _Device) -> bool:
     """Returns whether late replies may come that only this client knows."""
-    return device.key.transport not in IN_FLIGHT and time.monotonic() < device.needed
+    return device.key.transport not in IN_FLIGHT and time.monotonic() < device.late_replies_until
 
 
 class _PoolTurns(Turns):
@@ -133,7 +133,7 @@ class Pool:
         idle: float,
         tls: Tls = NO_FILES,
         dial: Dial = connection,
-        shared: Shared | None = None,
+        shared: ApplianceLinks | None = None,
     ) -> None:
         self._most = most
         self._in_flight = in_flight
@@ -172,6 +172,7 @@ class Pool:
                 if turns is not None:
                     with contextlib.suppress(Elsewhere):
                         return await call(turns)
+        # Addresses with a connection first.
         *earlier, last = sorted(route.allowed, key=lambda each: each not in self._entries)
         for target in earlier:
             try:
@@ -200,25 +201,25 @@ class Pool:
         """Sends a request whose turn has come, and returns the result."""
         key = device.key
         try:
-            if device.doubtful and device.in_flight == 1:
+            if device.is_state_unknown and device.in_flight == 1:
                 await self._refresh(device)
-            device.doubtful = True
+            device.is_state_unknown = True
             result = None
-            if is_broadcast(key.transport, unit):
+            if broadcast.is_broadcast(key.transport, unit):
                 await device.transport.close()  # The peer may accept only one connection.
                 note_sent()
-                await send(self._dial(key, 1), request, timeout)
+                await broadcast.send(self._dial(key, 1), request, timeout)
             else:
                 result = await device.transport.call(request, unit, timeout, note_sent)
-            device.doubtful = False
+            device.is_state_unknown = False
             return result
         except ModbusException:
-            device.doubtful = False
+            device.is_state_unknown = False
             raise
         finally:
             device.used = time.monotonic()
-            if device.doubtful:
-                device.needed = device.used + timeout + MAX_LATENESS_S
+            if device.is_state_unknown:
+                device.late_replies_until = device.used + timeout + MAX_LATENESS_S
 
     def pass_on(self, device: _Device) -> None:
         """Gives the place of a request that has ended to those that wait."""
@@ -240,11 +241,11 @@ class Pool:
         assert worker is not None
         try:
             if close:
-                device.doubtful = False
+                device.is_state_unknown = False
                 try:
                     await device.transport.close()
                 except Exception:
-                    device.doubtful = True  # The next request closes it, or gets the error.
+                    device.is_state_unknown = True  # The next request closes it, or gets the error.
             while device.waiting:
                 now = device.waiting.first
                 if all(caller.done() for caller in now.callers):
@@ -277,7 +278,7 @@ class Pool:
             most = self._in_flight if key.transport in IN_FLIGHT else 1
             device = self._entries[key] = _Device(key, transport, most)
             if gone is not None:
-                device.users += 1
+                device.users += 1  # So that it is not pushed out in turn.
                 try:
                     await gone.transport.close()
                 finally:
@@ -308,7 +309,7 @@ class Pool:
         if device.in_flight > 1:  # Another request uses it meanwhile.
             return
         old, device.transport = device.transport, made
-        device.doubtful = False
+        device.is_state_unknown = False
         await old.close()
 
     def _pushed_out(self) -> _Device:
@@ -316,7 +317,7 @@ class Pool:
         free = [
             each
             for each in self._entries.values()
-            if not (each.users or each.in_flight or _is_needed(each))
+            if not (each.users or each.in_flight or _expects_late_replies(each))
         ]
         if not free:
             raise BadRequest("busy", "too many devices are in use, try again later")
@@ -343,11 +344,11 @@ class Pool:
             # While the one before was closed, a request may have pushed this one out.
             if self._entries.get(key) is not entry or entry.users or entry.in_flight:
                 continue
-            if _is_needed(entry) and not self._is_shared(key):
-                if entry.doubtful:
+            if _expects_late_replies(entry) and not self._is_shared(key):
+                if entry.is_state_unknown:
                     entry.in_flight += 1
                     self._start(entry, close=True)
-            elif entry.doubtful or entry.used < latest or self._is_shared(key):
+            elif entry.is_state_unknown or entry.used < latest or self._is_shared(key):
                 del self._entries[key]
                 with contextlib.suppress(Exception):
                     await entry.transport.close()

@@ -61,7 +61,7 @@ class RepeatedWrites:
         self._pending: dict[tuple[str, str], _Write] = {}
         self._ended: dict[tuple[str, str], _Write] = {}
 
-    async def carry_out(
+    async def write_once(
         self, request: Request, device: RequestedDevice, write: Callable[[], Awaitable[Response]]
     ) -> Response:
         """Carries out a write, unless one with its key may have reached the device.
@@ -76,7 +76,8 @@ class RepeatedWrites:
         while (known := self._known(name)) is not None:
             if known.request != digest:
                 raise malformed(f"{KEY.name} was used for another request, allowed: a new one")
-            device.maybe_sent = True  # Until it is known, also for who stops waiting.
+            # The first may have reached the device: if this request is cancelled here, it says so.
+            device.maybe_sent = True
             await known.ended.wait()
             if known.response is not None:
                 return known.response
@@ -85,8 +86,8 @@ class RepeatedWrites:
             device.maybe_sent = False
         return await self._first(name, _Write(digest), device, write)
 
-    def tell(self, request: Request, refusal: BadRequest) -> None:
-        """Says in a refusal of a repetition that the first may have been carried out.
+    def add_maybe_written_header(self, request: Request, refusal: BadRequest) -> None:
+        """Says in the refusal of a repetition that the first may have been carried out.
 
         A repetition may be refused before its key is looked up, for example as one too many.
         """

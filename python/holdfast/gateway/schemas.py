@@ -6,7 +6,7 @@ from typing import get_args
 
 from holdfast.discovery.address_search import State
 from holdfast.gateway.endpoints import tag_lists
-from holdfast.gateway.endpoints.read import FUNCTION_SCHEMA, RANGE_PROPERTIES, TYPED
+from holdfast.gateway.endpoints.read import FUNCTION_SCHEMA, RANGE_PROPERTIES, TYPED_ANSWER_FIELDS
 from holdfast.gateway.fields import ADDRESS_SCHEMA, UNIT_SCHEMA
 from holdfast.net.addresses import LAST_PORT
 from holdfast.net.http.schemas import (
@@ -24,7 +24,7 @@ from holdfast.net.http.schemas import (
 from holdfast.protocol import READ_BITS
 from holdfast.types import AREAS
 
-TARGET: dict[str, Schema] = {
+TARGET_SCHEMAS: dict[str, Schema] = {
     "host": TEXT,
     "port": integer(1, LAST_PORT),
     "unitId": UNIT_SCHEMA,
@@ -52,10 +52,10 @@ _ERRORS: dict[str, Schema] = {
         {
             "success": {"const": False},
             "error": {**TEXT, "examples": ["Modbus exception: Illegal Data Address (code 0x2)"]},
-            **TARGET,
+            **TARGET_SCHEMAS,
             **_ASKED,
         },
-        optional=(*TARGET, *_ASKED),
+        optional=(*TARGET_SCHEMAS, *_ASKED),
     ),
 }
 _STATUS = object_of(
@@ -76,7 +76,7 @@ _TYPED_CHANGE = object_of(
     {"index": COUNT, "value": {}, "text": TEXT, "error": TEXT}, optional=("error",)
 )
 _WATCHES: dict[str, Schema] = {
-    "Values": object_of({**_NOW, **RANGE_PROPERTIES}, optional=tuple(TYPED)),
+    "Values": object_of({**_NOW, **RANGE_PROPERTIES}, optional=tuple(TYPED_ANSWER_FIELDS)),
     "Change": object_of(
         {
             **_NOW,

@@ -46,7 +46,7 @@ class Elsewhere(Exception):
     """The connection leads to an address that the request may not reach. Nothing was sent."""
 
 
-class Shared:
+class ApplianceLinks:
     """The links of an appliance, in one event loop."""
 
     def __init__(self, poller: Poller) -> None:
@@ -125,7 +125,7 @@ class Turns:
     """Sends the requests of one caller to a device, each when its turn comes."""
 
     late, longest_late = 0, 0.0
-    """Late replies are counted where the connection is."""
+    """Required by `AsyncTransport`. The connection counts its late replies."""
 
     def __init__(self, target: NetworkTarget) -> None:
         self.target = target

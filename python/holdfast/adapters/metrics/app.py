@@ -107,7 +107,7 @@ class App(Application):
         """Returns the error for another path."""
         return f"the metrics are at {PATH}, the health at {' and '.join(probes.PATHS)}"
 
-    def refused(self, _: Request, error: Exception) -> Response:
+    def error_response(self, _: Request, error: Exception) -> Response:
         """Returns the refusal of a request."""
         if not isinstance(error, BadRequest):
             raise error

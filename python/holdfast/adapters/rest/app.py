@@ -97,7 +97,7 @@ class App(Application):
         self.call_soon(self._streams.end)
         self.call_soon(self._device_writes.end)
 
-    def refused(self, request: Request, error: Exception) -> Response:
+    def error_response(self, request: Request, error: Exception) -> Response:
         """Returns the refusal, and counts it unless the memory access has."""
         refused = error
         if isinstance(error, BadRequest):

@@ -10,8 +10,14 @@ from holdfast.discovery import address_search
 from holdfast.discovery.address_search import Survey
 from holdfast.errors import ConnectionLost, ModbusError, ModbusException
 from holdfast.gateway.device import Failed
-from holdfast.gateway.endpoint import TARGET
-from holdfast.gateway.fields import ADDRESS_SCHEMA, AREA_LIST, MAP_READ_TIMEOUT_MS, timeout
+from holdfast.gateway.endpoint import TARGET_FIELDS
+from holdfast.gateway.fields import (
+    ADDRESS_SCHEMA,
+    AREA_LIST,
+    MAP_READ_TIMEOUT_MS,
+    max_streams,
+    timeout,
+)
 from holdfast.net.http.fields import Field, malformed
 from holdfast.net.http.requests import BadRequest
 from holdfast.net.http.schemas import BOOLEAN, integer
@@ -44,18 +50,13 @@ MAX_SHOWN = 500
 def fields(limits: GatewayLimits) -> tuple[Field, ...]:
     """Returns the fields of a request for a map."""
     return (
-        *TARGET,
+        *TARGET_FIELDS,
         AREA_LIST,
         Field("first", ADDRESS_SCHEMA, "The first address to map", 0),
         Field("last", ADDRESS_SCHEMA, "The last address to map", LAST_ADDRESS),
         Field("exact", BOOLEAN, "Read every address instead of samples", False),
         Field("maxQuantity", integer(1, READ_BITS), "Largest quantity of one read", None),
-        Field(
-            "maxStreams",
-            integer(1, 64),
-            "Refuse the map (`busy`) if the client's address has this many streams",
-            None,
-        ),
+        max_streams("Refuse the map (`busy`) if the client's address has this many streams"),
         timeout(MAP_READ_TIMEOUT_MS, round(1000 * limits.timeout), "Timeout of each read in ms"),
     )
 
@@ -72,7 +73,7 @@ def _planned(given: Given) -> Survey:
     )
 
 
-async def survey(given: Given, device: RequestedDevice, stream: Stream, longest: float) -> None:
+async def map_device(given: Given, device: RequestedDevice, stream: Stream, longest: float) -> None:
     """Maps a device. A failure before the first response raises, as for a read."""
     survey = _planned(given)
     began = time.monotonic()

@@ -40,7 +40,7 @@ ENDPOINTS = (
             ),
             Field("data", array(REGISTER, MAX_WORDS), "Data words of the request", [0]),
         ),
-        carry_out=_diagnostics,
+        execute=_diagnostics,
         properties={"subFunction": REGISTER, "data": REGISTERS},
         examples={"The echo": {**EXAMPLE, "subFunction": 0, "data": [0xA537]}},
         answer={"subFunction": 0, "data": [0xA537]},

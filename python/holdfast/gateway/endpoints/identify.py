@@ -44,7 +44,7 @@ ENDPOINTS = (
         description=(
             "Function 17. The layout depends on the device: `data` is the whole response, in hex."
         ),
-        carry_out=_server_id,
+        execute=_server_id,
         properties={
             "serverId": {"type": ["integer", "null"]},
             "running": {"type": ["boolean", "null"]},
@@ -59,7 +59,7 @@ ENDPOINTS = (
         name="identify",
         summary="Read vendor, product and revision of a device",
         description="Function 43/14. It takes several requests if the device splits its objects.",
-        carry_out=_identify,
+        execute=_identify,
         properties={
             **dict.fromkeys(_NAMES.values(), TEXT_OR_NULL),
             "conformityLevel": integer(0, 255),

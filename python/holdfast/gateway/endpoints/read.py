@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from holdfast.errors import ModbusException
 from holdfast.gateway.device import exception_name, exception_text
 from holdfast.gateway.endpoint import EXAMPLE, Endpoint
-from holdfast.gateway.endpoints.typed import quantity_of, typed
+from holdfast.gateway.endpoints.typed import parse_value_type, quantity_of
 from holdfast.gateway.fields import (
     ADDRESS,
     ADDRESS_SCHEMA,
@@ -24,7 +24,7 @@ from holdfast.types import BIT_AREAS
 if TYPE_CHECKING:
     from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Answer, Given
-    from holdfast.gateway.endpoints.typed import Typed
+    from holdfast.gateway.endpoints.typed import ValueType
     from holdfast.types import Area
 
 AREAS_READ = {each.code: area for area, each in READ_FUNCTIONS.items()}
@@ -66,7 +66,9 @@ class Range:
         self.function: int = given["functionCode"]
         self.area: Area = AREAS_READ[self.function]
         self.address: int = given["address"]
-        self.kind: Typed | None = typed(given["datatype"], given["byteOrder"], self.area)
+        self.kind: ValueType | None = parse_value_type(
+            given["datatype"], given["byteOrder"], self.area
+        )
         self.quantity = quantity_of(given["quantity"], self.kind)
         limit = READ_LIMITS[self.area]
         if not 1 <= self.quantity <= limit:
@@ -122,7 +124,7 @@ def _read_exception(given: Given, _: RequestedDevice, error: ModbusException) ->
     }
 
 
-TYPED: dict[str, Schema] = {
+TYPED_ANSWER_FIELDS: dict[str, Schema] = {
     "typed": {
         "type": "array",
         "description": "With `datatype`: the values, `null` where `typedErrors` has the reason",
@@ -137,7 +139,7 @@ RANGE_PROPERTIES: dict[str, Schema] = {
     "quantity": integer(1, READ_BITS),
     "format": {"enum": ["coils", "registers"]},
     "values": array_of({**REGISTER, "type": ["integer", "boolean"]}),
-    **TYPED,
+    **TYPED_ANSWER_FIELDS,
 }
 
 ENDPOINTS = (
@@ -148,7 +150,7 @@ ENDPOINTS = (
         description=(
             "Reads holding register 0. A Modbus exception also shows that the device is reachable."
         ),
-        carry_out=_connect,
+        execute=_connect,
         has_rtt=False,
         properties={"message": TEXT, "testRegister": REGISTER, "exception": TEXT},
         optional=("testRegister", "exception"),
@@ -161,10 +163,10 @@ ENDPOINTS = (
         summary="Read coils, discrete inputs, holding or input registers",
         description=f"Functions 1 to 4. `values` are booleans, or register values 0 to {MAX_WORD}.",
         fields=RANGE,
-        carry_out=_read,
+        execute=_read,
         has_rtt=False,
         properties={"functionCode": FUNCTION_SCHEMA, "functionName": TEXT, **RANGE_PROPERTIES},
-        optional=tuple(TYPED),
+        optional=tuple(TYPED_ANSWER_FIELDS),
         examples={
             "Five registers": {**EXAMPLE, "functionCode": 3, "address": 100, "quantity": 5},
             "Two floats, low word first": {

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from holdfast.config.tag_files.read import parse_tags
 from holdfast.gateway.endpoint import REGISTERS
 from holdfast.gateway.endpoints import request_tags, typed
-from holdfast.gateway.endpoints.read import TYPED
-from holdfast.gateway.fields import BYTE_ORDER, DATATYPE, REGISTER, TYPED_SCHEMA
+from holdfast.gateway.endpoints.read import TYPED_ANSWER_FIELDS
+from holdfast.gateway.fields import BYTE_ORDER, DATATYPE, REGISTER, TYPED_VALUE_SCHEMA
 from holdfast.net.http.fields import REQUIRED, Field
 from holdfast.net.http.openapi import json_answer
 from holdfast.net.http.operations import Operation, body_of
@@ -138,7 +138,7 @@ OPERATIONS: tuple[Operation[Any], ...] = (
         "Check typed values before they are written",
         lambda app, request, given: app.check(request, typed.encode, given),
         _valid(
-            {"values": REGISTERS, **TYPED},
+            {"values": REGISTERS, **TYPED_ANSWER_FIELDS},
             {"values": [0, 0x41AC], "typed": [21.5], "typedText": ["21.5"]},
             optional=("typedErrors",),
         ),
@@ -149,7 +149,7 @@ OPERATIONS: tuple[Operation[Any], ...] = (
             (
                 Field(
                     "values",
-                    array(TYPED_SCHEMA, WRITE_REGISTERS),
+                    array(TYPED_VALUE_SCHEMA, WRITE_REGISTERS),
                     f"Values of the type, bytes in hex, for up to {WRITE_REGISTERS} registers",
                 ),
                 replace(DATATYPE, default=REQUIRED),

@@ -28,8 +28,8 @@ NUMBERS = sorted((each for each in FIXED if each != "bool"), key=lambda each: FI
 
 
 @dataclass(frozen=True)
-class Typed:
-    """A sequence of values of one type."""
+class ValueType:
+    """The type of the values of a request, and their byte order."""
 
     element: str
     order: str
@@ -97,7 +97,7 @@ def _flaw(value: ConversionError | float) -> str:
     return "not a number" if value != value else "infinite"
 
 
-def typed(datatype: str | None, order: str, area: Area) -> Typed | None:
+def parse_value_type(datatype: str | None, order: str, area: Area) -> ValueType | None:
     """Returns the type of a request; `None` without `datatype`. Raises `BadRequest`."""
     if datatype is None:
         if order != DEFAULT_ORDER:
@@ -110,7 +110,7 @@ def typed(datatype: str | None, order: str, area: Area) -> Typed | None:
         raise malformed(f"datatype is {datatype}, allowed for {of}: bool") from None
     except ConversionError as error:
         raise malformed(str(error)) from None
-    return Typed(type.element, order, type.width // 2, type.count)
+    return ValueType(type.element, order, type.width // 2, type.count)
 
 
 async def encode(given: Given, _: object) -> Answer:
@@ -118,7 +118,7 @@ async def encode(given: Given, _: object) -> Answer:
 
     Raises `BadRequest`.
     """
-    kind = typed(given["datatype"], given["byteOrder"], "holding_registers")
+    kind = parse_value_type(given["datatype"], given["byteOrder"], "holding_registers")
     assert kind is not None
     registers = kind.encode(given["values"])
     return {"success": True, "values": registers, **kind.decode(registers)}
@@ -152,7 +152,7 @@ def _table(registers: list[int], orders: Sequence[str], types: Sequence[str]) ->
     for name in types:
         width = FIXED[name] // 2
         if width <= len(registers):
-            kinds = [Typed(name, order, width, None) for order in orders]
+            kinds = [ValueType(name, order, width, None) for order in orders]
             texts = [kind.decode(registers[:width])["typedText"][0] for kind in kinds]
             rows.append({"type": name, "texts": texts})
     return {"orders": list(orders), "rows": rows}
@@ -174,7 +174,7 @@ def _bits_on(register: int) -> str:
     return " ".join("–".join(map(str, run)) for run in runs) or "none"
 
 
-def quantity_of(given: int | None, kind: Typed | None) -> int:
+def quantity_of(given: int | None, kind: ValueType | None) -> int:
     """Returns the quantity to read: `given`, or by default the size of the type.
 
     Raises `BadRequest` if `given` does not fit the type.

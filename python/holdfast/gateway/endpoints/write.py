@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from holdfast.gateway.endpoint import EXAMPLE, REGISTERS, Endpoint, always
-from holdfast.gateway.endpoints.typed import typed
+from holdfast.gateway.endpoints.typed import parse_value_type
 from holdfast.gateway.fields import (
     ADDRESS,
     ADDRESS_SCHEMA,
@@ -14,7 +14,7 @@ from holdfast.gateway.fields import (
     BYTE_ORDER,
     DATATYPE,
     REGISTER,
-    TYPED_SCHEMA,
+    TYPED_VALUE_SCHEMA,
     WRITE_TIMEOUT_MS,
     check_end,
 )
@@ -81,7 +81,7 @@ async def _read_write(given: Given, device: RequestedDevice) -> Answer:
 
 def _registers(given: Given) -> Sequence[int]:
     """Returns the registers to write. Raises `BadRequest`."""
-    kind = typed(given["datatype"], given["byteOrder"], "holding_registers")
+    kind = parse_value_type(given["datatype"], given["byteOrder"], "holding_registers")
     if kind is not None:
         return kind.encode(given["values"])
     checked: Sequence[int] = REGISTER_VALUES.check(given["values"])
@@ -109,7 +109,7 @@ ENDPOINTS = (
         summary="Write one coil",
         description="Function 5. `coilValue` is the value in the Modbus frame: 65280 is on.",
         fields=(ADDRESS, Field("value", BIT, "`true` or 1 is on, `false` or 0 is off")),
-        carry_out=_write_coil,
+        execute=_write_coil,
         properties={
             "address": ADDRESS_SCHEMA,
             "coilValue": {"enum": [0, ON]},
@@ -128,7 +128,7 @@ ENDPOINTS = (
         fields=(
             ADDRESS,
             _values(
-                TYPED_SCHEMA,
+                TYPED_VALUE_SCHEMA,
                 WRITE_REGISTERS,
                 f"Up to {WRITE_REGISTERS} register values 0 to {MAX_WORD}; with `datatype`, values "
                 "of that type, bytes in hex",
@@ -136,7 +136,7 @@ ENDPOINTS = (
             DATATYPE,
             BYTE_ORDER,
         ),
-        carry_out=_write_registers,
+        execute=_write_registers,
         properties=_written(WRITE_REGISTERS),
         examples={
             "Three registers": {**EXAMPLE, "address": 100, "values": [1000, 2000, 3000]},
@@ -156,7 +156,7 @@ ENDPOINTS = (
         summary="Write one holding register",
         description="Function 6.",
         fields=(ADDRESS, Field("value", REGISTER, f"0 to {MAX_WORD}")),
-        carry_out=_write_register,
+        execute=_write_register,
         properties={"address": ADDRESS_SCHEMA, "value": REGISTER},
         examples={"Register 5": {**EXAMPLE, "address": 5, "value": 1234}},
         answer={"address": 5, "value": 1234},
@@ -170,7 +170,7 @@ ENDPOINTS = (
             ADDRESS,
             _values(BIT, WRITE_BITS, f"Up to {WRITE_BITS} of `true`, `false`, 1, 0"),
         ),
-        carry_out=_write_coils,
+        execute=_write_coils,
         properties=_written(WRITE_BITS),
         examples={"Three coils": {**EXAMPLE, "address": 16, "values": [True, False, True]}},
         answer={"startAddress": 16, "quantity": 3},
@@ -187,7 +187,7 @@ ENDPOINTS = (
             Field("andMask", REGISTER, "Bits to keep"),
             Field("orMask", REGISTER, "New values of the other bits"),
         ),
-        carry_out=_mask,
+        execute=_mask,
         properties={"address": ADDRESS_SCHEMA, "andMask": REGISTER, "orMask": REGISTER},
         examples={"Set bit 3": {**EXAMPLE, "address": 4, "andMask": 0xFFF7, "orMask": 8}},
         answer={"address": 4, "andMask": 0xFFF7, "orMask": 8},
@@ -209,7 +209,7 @@ ENDPOINTS = (
                 f"Registers to write, up to {READ_WRITE.most_written}",
             ),
         ),
-        carry_out=_read_write,
+        execute=_read_write,
         properties={
             "writeAddress": ADDRESS_SCHEMA,
             "written": integer(1, READ_WRITE.most_written),

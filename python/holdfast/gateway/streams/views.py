@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.client.tag_reading import TagReader
 from holdfast.errors import ModbusError, ModbusException
-from holdfast.gateway.device import Failed, exception_text, problem
-from holdfast.gateway.endpoint import TARGET
+from holdfast.gateway.device import Failed, error_fields, exception_text
+from holdfast.gateway.endpoint import TARGET_FIELDS
 from holdfast.gateway.endpoints.read import RANGE, Range
 from holdfast.gateway.endpoints.request_tags import LIST, MAX_TAGS, NAME, described, tags_of
-from holdfast.gateway.fields import POLL_TIMEOUT_MS, timeout
+from holdfast.gateway.fields import POLL_TIMEOUT_MS, max_streams, timeout
 from holdfast.gateway.streams.watch import interval_field
 from holdfast.net.http.fields import Field, filled, malformed, object_with
 from holdfast.net.http.requests import BadRequest, shown
-from holdfast.net.http.schemas import BOOLEAN, Schema, array, integer
+from holdfast.net.http.schemas import BOOLEAN, Schema, array
 from holdfast.tags.decoding import packed
 from holdfast.tags.text import plain, text_of
 from holdfast.types import BIT_AREAS
@@ -46,19 +46,16 @@ PARTS = Field(
     array(PART_SCHEMA, MAX_PARTS),
     "Ranges, and tag lists as text or by the name of a profile",
 )
-MAX_STREAMS = Field(
-    "maxStreams",
-    integer(1, 64),
+MAX_STREAMS = max_streams(
     "With this many streams for the client's address, or with no stream left, the stream ends "
-    "after its first event, as with `once`: browsers allow six connections to a host",
-    None,
+    "after its first event, as with `once`: browsers allow six connections to a host"
 )
 
 
 def fields(limits: GatewayLimits) -> tuple[Field, ...]:
     """Returns the fields of a request for a view."""
     return (
-        *TARGET,
+        *TARGET_FIELDS,
         PARTS,
         interval_field(limits),
         Field("once", BOOLEAN, "End after the first event", False),
@@ -230,12 +227,12 @@ class View:
                     each.state, each.problem = await each.part.read(self._device), {}
                     answered, each.silent = True, 0
                 except ModbusException as error:
-                    each.problem = problem(error)
+                    each.problem = error_fields(error)
                     answered, each.silent = True, 0
                 except (Failed, BadRequest) as error:
                     ended, each.silent = error, self._number
             if ended is not None:
-                each.problem = problem(ended)
+                each.problem = error_fields(ended)
         self._took = round(1000 * (time.perf_counter() - began))
         if ended is not None and not answered:
             raise ended

@@ -7,8 +7,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from holdfast.errors import ModbusException
-from holdfast.gateway.device import Failed, problem
-from holdfast.gateway.endpoint import TARGET
+from holdfast.gateway.device import Failed, error_fields
+from holdfast.gateway.endpoint import TARGET_FIELDS
 from holdfast.gateway.endpoints.read import RANGE, Range
 from holdfast.gateway.fields import POLL_TIMEOUT_MS, timeout
 from holdfast.net.http.fields import Field
@@ -45,7 +45,7 @@ def interval_field(limits: GatewayLimits) -> Field:
 def fields(limits: GatewayLimits) -> tuple[Field, ...]:
     """Returns the fields of a request for a watch."""
     return (
-        *TARGET,
+        *TARGET_FIELDS,
         *RANGE,
         interval_field(limits),
         timeout(POLL_TIMEOUT_MS, round(1000 * limits.timeout), "Timeout of each poll in ms"),
@@ -62,7 +62,7 @@ async def watch(given: Given, device: RequestedDevice, stream: Stream) -> None:
     try:
         event = view.all(await view.wanted.read(device))
     except ModbusException as error:
-        event = view.problem(error)
+        event = view.problem_event(error)
     await stream.begin()
     while True:
         if event is not None:
@@ -73,7 +73,7 @@ async def watch(given: Given, device: RequestedDevice, stream: Stream) -> None:
         try:
             event = view.changed(await stream.during(view.wanted.read(device)))
         except (ModbusException, Failed, BadRequest) as error:
-            event = view.problem(error)
+            event = view.problem_event(error)
 
 
 class _View:
@@ -102,9 +102,9 @@ class _View:
         values = [{"address": self.wanted.address + at, "value": found[at]} for at in places]
         return "change", {**self._now(), "changes": values, **self._typed(found, places)}
 
-    def problem(self, error: ModbusException | Failed | BadRequest) -> Event | None:
+    def problem_event(self, error: ModbusException | Failed | BadRequest) -> Event | None:
         """Returns an event with the error; `None` if the client knows it already."""
-        found = problem(error)
+        found = error_fields(error)
         if found == self._problem:
             return None
         self._problem = found

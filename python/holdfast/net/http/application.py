@@ -94,7 +94,7 @@ class Application:
 
     # What a subclass has.
 
-    def refused(self, request: Request, error: Exception) -> Response:
+    def error_response(self, request: Request, error: Exception) -> Response:
         """Returns the response to what a handler raised. Raises it if it is no refusal."""
         raise NotImplementedError
 
@@ -165,7 +165,7 @@ class Application:
         return answer
 
     def _refusal(self, request: Request, error: Exception) -> Response:
-        answer = self.refused(request, error)
+        answer = self.error_response(request, error)
         answer.headers = (*answer.headers, *headers_with(answer.status))
         answer.closes = answer.status in UNREAD or request.header(b"expect") is not None
         return answer
