@@ -206,9 +206,9 @@ class Picture {
     this.absent = absentRanges ?? null;
     this.failures = failures ?? {};
     this.givenUp = givenUp;
-    this.told = absentRanges ? `${absent.toLocaleString("en")} asked and absent, ${notAsked.toLocaleString("en")} not asked` : null;
+    this.absentText = absentRanges ? `${absent.toLocaleString("en")} asked and absent, ${notAsked.toLocaleString("en")} not asked` : null;
     this.count.textContent = addresses === 1 ? "1 address" : `${addresses.toLocaleString("en")} addresses`;
-    this.canvas.setAttribute("aria-label", `${this.title}: ${this.count.textContent} in ${this.ranges.length} ranges${this.told ? `, ${this.told}` : ""}`);
+    this.canvas.setAttribute("aria-label", `${this.title}: ${this.count.textContent} in ${this.ranges.length} ranges${this.absentText ? `, ${this.absentText}` : ""}`);
     this.draw();
   }
 
@@ -294,7 +294,7 @@ class Picture {
       items.push(h("li", { class: "wrong" }, `${count} with ${FAILURES[kind] ?? `exception ${kind}`}`));
     }
     if (items.length === 0) items.push(h("li", { class: "dim" }, this.givenUp === 1 ? "The device does not support this area." : "None found."));
-    if (this.told) items.push(h("li", { class: "dim" }, `${this.told}.`));
+    if (this.absentText) items.push(h("li", { class: "dim" }, `${this.absentText}.`));
     this.ranged.replaceChildren(...items);
   }
 }

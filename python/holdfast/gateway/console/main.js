@@ -89,7 +89,7 @@ async function connect(again = false) {
   const aborting = new AbortController();
   connecting = aborting;
   say($("connection"), "Connecting…");
-  let told = null;
+  let shownError = null;
   while (connecting === aborting) {
     try {
       await loadGatewaySettings();
@@ -103,8 +103,8 @@ async function connect(again = false) {
       if (connecting !== aborting) return;
       const retries = again && !FINAL.has(error.reason);
       if (!retries) connecting = null;
-      if (error.message !== told) say($("connection"), notice(error), retries ? "Retrying…" : null, UNPROVEN.has(error.reason) ? offer(asked) : null);
-      told = error.message;
+      if (error.message !== shownError) say($("connection"), notice(error), retries ? "Retrying…" : null, UNPROVEN.has(error.reason) ? offer(asked) : null);
+      shownError = error.message;
       if (retries) await pause(RESUME);
     }
   }

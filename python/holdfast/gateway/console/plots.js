@@ -24,10 +24,10 @@ export class Plots {
     /** The time of the last poll in seconds, by the clock of the gateway, and what tells how long ago it was. */
     this.latest = 0;
     this.since = stopwatch();
-    this.told = h("p", { class: "dim", role: "status" });
+    this.status = h("p", { class: "dim", role: "status" });
     this.place.replaceChildren(h("div", { class: "bar" }, ...this.chooser(),
       h("label", {}, "Time span", this.spans()),
-      h("button", { type: "button", onclick: () => this.download() }, "Download plots as CSV"), this.told));
+      h("button", { type: "button", onclick: () => this.download() }, "Download plots as CSV"), this.status));
     this.place.hidden = false;
     this.timer = setInterval(() => this.draw(), TICK);
     this.resized = new ResizeObserver(() => this.shown.forEach((plot) => plot.fit()));
@@ -68,23 +68,23 @@ export class Plots {
     const address = Number(text);
     const last = first + quantity - 1;
     if (text === "" || !(address >= first && address <= last)) {
-      this.told.textContent = text ? `${text} is not watched, only ${first} to ${last}.` : `Enter an address from ${first} to ${last}.`;
+      this.status.textContent = text ? `${text} is not watched, only ${first} to ${last}.` : `Enter an address from ${first} to ${last}.`;
     } else {
       this.wishKey(`0.${address}`);
     }
   }
 
   wishKey(key) {
-    if (this.shown.has(key)) this.told.textContent = `${this.shown.get(key).label} is already plotted.`;
+    if (this.shown.has(key)) this.status.textContent = `${this.shown.get(key).label} is already plotted.`;
     else this.toggle(key);
   }
 
   /** Adds the plot of a value, or removes it. */
   toggle(key) {
-    this.told.textContent = "";
+    this.status.textContent = "";
     if (this.shown.has(key)) this.remove(key);
     else if (this.shown.size < MAX_PLOTS) this.add(key);
-    else this.told.textContent = `There can be at most ${MAX_PLOTS} plots. Remove one first.`;
+    else this.status.textContent = `There can be at most ${MAX_PLOTS} plots. Remove one first.`;
     this.chosen = true;
     this.onChoice();
   }
@@ -223,8 +223,8 @@ class Plot {
     const gaps = this.history.gaps().filter(([, end]) => end === null || end >= start);
     const open = this.root.classList.contains("old");
     this.extent.textContent = open ? `no value since ${timeOf(this.history.until || now)}` : extent;
-    const told = gaps.length === 0 ? "" : `, ${gaps.length} ${gaps.length === 1 ? "gap" : "gaps"}`;
-    this.body.setAttribute("aria-label", `Plot of ${this.label}${told}`);
+    const gapText = gaps.length === 0 ? "" : `, ${gaps.length} ${gaps.length === 1 ? "gap" : "gaps"}`;
+    this.body.setAttribute("aria-label", `Plot of ${this.label}${gapText}`);
   }
 
   /** Creates the plot again, in the current colors. */

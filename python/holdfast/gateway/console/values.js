@@ -296,16 +296,16 @@ export class Values {
     if (outcome === null) return;
     // A reload of the gateway may have taken the right to write.
     if (outcome === "refused") await this.gateway.refresh().catch(() => {});
-    const told = WRITTEN[outcome];
+    const outcomeText = WRITTEN[outcome];
     const { device } = panel.part;
     const isShown = () => this.panels.includes(panel) && this.device === device;
-    const where = `${told}: ${cell} of ${parts.hostAndPort(device)}.`;
-    const tell = () => say($("outcome"), this.watching && isShown() ? `${told}. The watch continues.` : where);
-    if (this.device !== device) return tell();
+    const where = `${outcomeText}: ${cell} of ${parts.hostAndPort(device)}.`;
+    const sayOutcome = () => say($("outcome"), this.watching && isShown() ? `${outcomeText}. The watch continues.` : where);
+    if (this.device !== device) return sayOutcome();
     // What is read already may be older than the write.
     if (this.watching) {
       this.watching.request.abort();
-      return tell();
+      return sayOutcome();
     }
     if (this.reading) return this.read(this.reading.wanted, where);
     const turn = (this.turn += 1);
@@ -313,18 +313,18 @@ export class Values {
     const isNewest = () => this.device === device && this.turn === turn;
     try {
       const data = await this.once(this.wholes);
-      if (!isNewest()) return tell();
+      if (!isNewest()) return sayOutcome();
       if (!this.fits(data)) this.show(this.wholes, data);
       this.take(data, true);
       const own = data.parts[this.wholes.indexOf(panel.whole)];
-      if (!own) return tell();
+      if (!own) return sayOutcome();
       if (own.error) throw new Problem(own.reason, own.error, own.code);
-      const changed = `${told} and read back. Changes are marked.`;
-      say($("outcome"), outcome === "written" ? changed : `${told}. The table shows the values read back.`);
+      const changed = `${outcomeText} and read back. Changes are marked.`;
+      say($("outcome"), outcome === "written" ? changed : `${outcomeText}. The table shows the values read back.`);
     } catch (error) {
-      if (!isNewest()) return tell();
+      if (!isNewest()) return sayOutcome();
       (this.panels.includes(panel) ? [panel] : this.panels).forEach((each) => each.stale("Reading back failed."));
-      say($("outcome"), notice(error, `${told}. Reading back failed.`));
+      say($("outcome"), notice(error, `${outcomeText}. Reading back failed.`));
     }
   }
 
@@ -360,7 +360,7 @@ export class Values {
     this.pressed(true);
     this.remember();
     say($("outcome"), "Reading…");
-    let told = null;
+    let lastReason = null;
     while (this.watching === watch) {
       watch.request = new AbortController();
       const { signal } = watch.request;
@@ -369,7 +369,7 @@ export class Values {
       const describe = !this.polls || wanted.some((part) => part.source?.profile);
       const more = { interval: this.interval, maxStreams: MAX_STREAMS.watch, describe };
       try {
-        if (told !== null) await this.gateway.refresh();
+        if (lastReason !== null) await this.gateway.refresh();
         await this.stream(wanted, more, signal, (name, data) => {
           if (this.watching !== watch) return;
           if (name === "view") {
@@ -378,14 +378,14 @@ export class Values {
           } else if (name === "change" && streams !== null) {
             this.take(data, true);
           }
-          told = null;
+          lastReason = null;
         });
         if (this.watching !== watch) return;
         if (streams === false) {
           await pause(this.interval, signal);
           continue;
         }
-        told = this.interrupted(null, told);
+        lastReason = this.interrupted(null, lastReason);
       } catch (error) {
         if (this.watching !== watch) return;
         if (signal.aborted) continue;
@@ -395,7 +395,7 @@ export class Values {
           say($("outcome"), notice(error));
           return;
         }
-        told = this.interrupted(error, told);
+        lastReason = this.interrupted(error, lastReason);
       }
       await pause(RESUME);
     }
@@ -471,13 +471,13 @@ export class Values {
   }
 
   /** Handles an interrupted watch. Shows each reason once. */
-  interrupted(error, told) {
+  interrupted(error, lastReason) {
     const reason = error?.reason ?? "ended";
     this.panels.forEach((panel) => panel.stale("The gateway does not answer."));
     this.plots?.gap();
     this.reported = null;
     const gone = ["ended", "gateway_gone"];
-    if (reason === told || (gone.includes(reason) && gone.includes(told))) return told;
+    if (reason === lastReason || (gone.includes(reason) && gone.includes(lastReason))) return lastReason;
     const goes = "The watch resumes automatically. Press Stop to end it.";
     if (gone.includes(reason)) say($("outcome"), "The gateway ended the watch or does not answer. The watch resumes automatically when the gateway is back. Press Stop to end it.");
     else say($("outcome"), notice(error), goes);

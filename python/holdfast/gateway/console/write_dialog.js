@@ -82,7 +82,7 @@ export class Writer {
     else $("write-value").removeAttribute("list");
     $("write-value").value = "";
     $("write-error").replaceChildren();
-    this.tell("");
+    this.showStatus("");
     this.wait(asked, 0);
     this.freeze(asked, false);
     this.back();
@@ -135,7 +135,7 @@ export class Writer {
   }
 
   /** Says what the dialog waits for, or what has changed. */
-  tell(text) {
+  showStatus(text) {
     $("write-wait").textContent = text;
   }
 
@@ -168,9 +168,9 @@ export class Writer {
     this.wait(asked, 1);
     this.freeze(asked, true);
     $("write-error").replaceChildren();
-    let told = "";
+    let status = "";
     try {
-      if (asked.change) told = await this.confirm(asked);
+      if (asked.change) status = await this.confirm(asked);
       else await this.review(asked);
     } catch (error) {
       if (this.isAbout(asked)) this.reject(error);
@@ -178,12 +178,12 @@ export class Writer {
     asked.sending = null;
     this.freeze(asked, false);
     this.wait(asked, -1);
-    if (this.asked === asked) this.tell(told);
+    if (this.asked === asked) this.showStatus(status);
   }
 
   /** Checks what was typed, reads the current values, and shows them beside the new ones. */
   async review(asked) {
-    this.tell(READING);
+    this.showStatus(READING);
     const text = $("write-value").value;
     const isTyped = $("write-as").value === "typed" && !isPlain(asked.part);
     const change = await (asked.tag ? ofTag : isTyped ? ofType : ofWords)(asked, text);
@@ -220,7 +220,7 @@ export class Writer {
       // Nobody sees a hidden page. Before a write, it reads again.
       if (document.hidden || !this.isReviewed(asked, change)) continue;
       try {
-        if (await this.refresh(asked, change)) this.tell(CHANGED);
+        if (await this.refresh(asked, change)) this.showStatus(CHANGED);
       } catch (error) {
         if (this.isReviewed(asked, change)) this.reject(error);
       }
@@ -243,10 +243,10 @@ export class Writer {
     return differs;
   }
 
-  /** Writes what the review shows. If it has changed, shows that instead. Returns what to tell. */
+  /** Writes what the review shows. If it has changed, shows that instead. Returns the status to show. */
   async confirm(asked) {
     const { change, before } = asked;
-    this.tell(READING);
+    this.showStatus(READING);
     const headers = await keyHeader();
     // A tag that can't be read may have another definition too.
     if (change.tag) await ofTag(asked, $("write-value").value);
@@ -258,7 +258,7 @@ export class Writer {
       asked.looks = Date.now();
       return CHANGED;
     }
-    this.tell("Writing…");
+    this.showStatus("Writing…");
     asked.sending = this.write(asked, change, headers);
     await asked.sending;
     return "";
@@ -275,11 +275,11 @@ export class Writer {
     } catch (error) {
       const refused = error.maybeWritten === false || (error.maybeWritten === null && UNSENT.has(error.reason));
       if (refused) asked.outcome = doubt;
-      const told = refused ? "Not written." : "Unknown whether it was written.";
+      const outcomeText = refused ? "Not written." : "Unknown whether it was written.";
       const back = await change.read(asked.closing.signal).catch(() => null);
       if (!this.isAbout(asked)) return;
       this.back();
-      this.fail(notice(error, told), h("p", {}, compared(change, asked.before, back)));
+      this.fail(notice(error, outcomeText), h("p", {}, compared(change, asked.before, back)));
     }
   }
 }
