@@ -27,7 +27,7 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 
 from holdfast.config.models.outputs import MqttOutputConfig
-from holdfast.outputs import Buffer, Sending
+from holdfast.outputs import Buffer, OutputSender
 from holdfast.outputs.device_access import DeviceInfo
 from holdfast.outputs.mqtt import MqttOutput
 from holdfast.outputs.mqtt.messages import Payloads
@@ -140,7 +140,7 @@ def readings(count: int) -> list[Reading]:
 class Site:
     """A site without devices: only values are published."""
 
-    revision = answers = 0
+    revision = answering_revision = 0
     standby: frozenset[str] = frozenset()
 
     def __init__(self) -> None:
@@ -176,8 +176,8 @@ def settings(port: int, payload: str) -> MqttOutputConfig:
 def holdfast(port: int, count: int, payload: str) -> str:
     output = MqttOutput("bench", settings(port, payload), Site())
     buffer, stop = Buffer(), Stop()
-    sending = Sending("bench", output, buffer)
-    thread = threading.Thread(target=sending.run, args=[stop])
+    sender = OutputSender("bench", output, buffer)
+    thread = threading.Thread(target=sender.run, args=[stop])
     output.use_stop(stop)
     output.idle()  # Connects.
     changes = readings(count)

@@ -21,7 +21,7 @@ from holdfast.appliance.services import outputs
 from holdfast.appliance.services.supervision import Supervisor
 from holdfast.config import load
 from holdfast.events import log_lines
-from holdfast.outputs.buffer_file import Stored
+from holdfast.outputs.buffer_file import BufferFile
 from support import wire
 from support.polled import Fake, data, exception
 from support.readings import tag
@@ -194,7 +194,7 @@ def test_a_receiver_that_can_not_be_reached_delays_nothing_else(
         status = appliance.diagnostics.adapter("output/down")
         assert status is not None
         assert (status["connected"], status["readings"]["sent"]) == (False, 0)
-    stored = Stored(tmp_path / "down.db", 2**30, lambda _, name: tag(name))
+    stored = BufferFile(tmp_path / "down.db", 2**30, lambda _, name: tag(name))
     kept = []
     while found := stored.first(1):
         kept += [each.value for each in found if each.name == "power"]
@@ -238,7 +238,7 @@ def test_values_in_a_file_that_a_reload_takes_away_are_logged(
         appliance.reload(load(saved(tmp_path, made)))
     # At the end, values wait in a file for the next start.
     [record] = [each for each in caplog.records if each.message == "output_file_left"]
-    stored = Stored(tmp_path / "down.db", 2**30, lambda _, name: tag(name))
+    stored = BufferFile(tmp_path / "down.db", 2**30, lambda _, name: tag(name))
     stored.close()
     expected = {"output": "down", "file": str(stored.file), "count": stored.count}
     assert vars(record)["fields"] == expected

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from holdfast.outputs import Buffer
 from holdfast.outputs.buffer import MAX_ROW
-from holdfast.outputs.buffer_file import Stored
+from holdfast.outputs.buffer_file import BufferFile
 from holdfast.outputs.buffer_file_error import FileGone
 from holdfast.outputs.line_protocol import lines
 from holdfast.outputs.tag_meaning import meaning_of
@@ -38,13 +38,13 @@ class Opened:
     """Opens files, and closes them after the test."""
 
     def __init__(self) -> None:
-        self.all: list[Stored] = []
+        self.all: list[BufferFile] = []
 
     def __call__(
         self, file: Path, max_bytes: int = PLENTY, known: list[Any] | None = None
-    ) -> Stored:
+    ) -> BufferFile:
         tags = {each.name: each for each in known or [tag()]}
-        stored = Stored(file, max_bytes, lambda _, name: tags.get(name), lock_timeout=0.05)
+        stored = BufferFile(file, max_bytes, lambda _, name: tags.get(name), lock_timeout=0.05)
         # No test ends the system: nothing has to wait for the disk.
         stored._db.execute("PRAGMA synchronous=OFF")
         self.all.append(stored)
@@ -114,7 +114,7 @@ def test_a_file_comes_before_memory_and_survives(opened: Opened, tmp_path: Path)
     buffer.stored = opened(tmp_path / "b.db")
     buffer.offer(polls(5))
     assert numbers(buffer.take(2, 0)) == [0, 1]
-    buffer.keep(60, 2)
+    buffer.move_to_file(60, 2)
     buffer.offer(polls(2, 5))
     assert len(buffer) == 7
     buffer.detach()
@@ -139,7 +139,7 @@ def test_readings_that_come_while_others_are_stored_do_not_hold_up_the_output(
 
     monkeypatch.setattr(stored, "add", slow_disk)
     buffer.offer(polls(5))
-    buffer.keep(60, 2)
+    buffer.move_to_file(60, 2)
     assert (stored.count, len(buffer)) == (5, 11)
 
 
@@ -155,7 +155,7 @@ def test_what_is_dropped_while_others_are_stored_is_counted(
 
     monkeypatch.setattr(stored, "add", full)
     buffer.offer(polls(2))
-    buffer.keep(60)
+    buffer.move_to_file(60)
     assert buffer.dropped == 3 + 2
 
 
@@ -163,7 +163,7 @@ def test_storing_ends_in_time_and_loses_nothing(opened: Opened, tmp_path: Path) 
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
     buffer.offer(polls(5))
-    buffer.keep(0, 2)
+    buffer.move_to_file(0, 2)
     assert (buffer.stored.count, drained(buffer)) == (0, list(range(5)))
 
 
@@ -173,7 +173,7 @@ def test_a_large_step_is_stored_whole_and_sent_in_small_ones(
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
     buffer.offer(polls(2 * MAX_ROW + 1))
-    buffer.keep(60)
+    buffer.move_to_file(60)
     assert numbers(buffer.take(9, 0)) == list(range(MAX_ROW))
     assert drained(buffer) == list(range(2 * MAX_ROW + 1))
 
@@ -186,7 +186,7 @@ def test_what_is_taken_ends_with_a_whole_poll(
     buffer.offer([numbered(3), numbered(3, 3), numbered(1, 6)])
     if with_file:
         buffer.stored = opened(tmp_path / "b.db")
-        buffer.keep(60, 2)
+        buffer.move_to_file(60, 2)
     taken = []
     while readings := buffer.take(4, 0):
         taken.append(numbers(readings))
@@ -201,7 +201,7 @@ def test_small_rows_of_a_file_are_sent_together(opened: Opened, tmp_path: Path) 
     buffer.stored = opened(tmp_path / "b.db")
     for number in range(5):
         buffer.offer(polls(1, number))
-        buffer.keep(60)
+        buffer.move_to_file(60)
     assert numbers(buffer.take(3, 0)) == [0, 1, 2]
     buffer.done()
     assert (numbers(buffer.take(3, 0)), buffer.stored.count) == ([3, 4], 2)
@@ -224,7 +224,7 @@ def test_what_was_taken_from_the_file_is_taken_again_after_a_crash(
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
     buffer.offer(polls(3))
-    buffer.keep(60)
+    buffer.move_to_file(60)
     assert numbers(buffer.take(9, 0)) == [0, 1, 2]
     buffer.detach()
     again = Buffer()
@@ -331,10 +331,10 @@ def test_what_was_taken_from_a_damaged_file_is_not_lost(opened: Opened, tmp_path
     assert numbers(buffer.take(3, 0)) == [0, 1, 2]
     buffer.offer(polls(1, 6))
     with pytest.raises(FileGone, match="malformed"):
-        buffer.keep(60)
+        buffer.move_to_file(60)
     assert (buffer.dropped, len(buffer)) == (3, 4)
     stored = buffer.stored = opened(file)
-    buffer.keep(60)
+    buffer.move_to_file(60)
     assert stored.count == 4
     assert drained(buffer) == [0, 1, 2, 6]
 
@@ -405,7 +405,7 @@ def test_a_file_that_can_not_be_read_any_more_is_left_under_another_name(
     assert drained(buffer) == [3, 4]
 
 
-def without_constraints(stored: Stored) -> None:
+def without_constraints(stored: BufferFile) -> None:
     """A damaged row may have anything in any column."""
     stored._db.executescript(
         "ALTER TABLE readings RENAME TO sound;"
@@ -458,7 +458,7 @@ def test_a_row_that_can_not_be_counted_does_not_keep_others_from_being_stored(
     stored._db.execute(f"UPDATE readings SET {change}")
     buffer.offer(polls(4, 4))
     with pytest.raises(FileGone, match="row 1 has"):
-        buffer.keep(60)
+        buffer.move_to_file(60)
     assert buffer.dropped == 4
     assert drained(buffer) == [4, 5, 6, 7]
 
@@ -466,7 +466,7 @@ def test_a_row_that_can_not_be_counted_does_not_keep_others_from_being_stored(
 def test_rows_that_are_missing_end_the_use_of_a_file(opened: Opened, tmp_path: Path) -> None:
     """Nothing waits for them without end."""
     buffer = Buffer()
-    for use in (lambda: buffer.take(9, 0), lambda: buffer.keep(60)):
+    for use in (lambda: buffer.take(9, 0), lambda: buffer.move_to_file(60)):
         stored = buffer.stored = opened(tmp_path / "b.db", max_bytes=150)
         stored.add([numbered(4)])
         stored._db.execute("DELETE FROM readings")
@@ -507,11 +507,11 @@ def test_rows_in_a_wrong_order_are_not_sent_again(opened: Opened, tmp_path: Path
 def test_a_file_is_free_again_after_any_error(
     opened: Opened, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(_: Stored) -> None:
+    def fail(_: BufferFile) -> None:
         raise MemoryError
 
     with monkeypatch.context() as patched:
-        patched.setattr(Stored, "_recount", fail)
+        patched.setattr(BufferFile, "_recount", fail)
         with pytest.raises(MemoryError) as error:
             opened(tmp_path / "b.db")
     assert opened(tmp_path / "b.db").count == 0
@@ -532,10 +532,10 @@ def test_what_can_not_be_stored_stays_in_memory(
     with monkeypatch.context() as patched:
         patched.setattr(buffer.stored, "add", full)
         with pytest.raises(error, match="disk is full"):
-            buffer.keep(60)
+            buffer.move_to_file(60)
         assert numbers(buffer.take(2, 0)) == [0, 1, 2]
         with pytest.raises(error, match="disk is full"):
-            buffer.keep(60)
+            buffer.move_to_file(60)
     assert drained(buffer) == [0, 1, 2]
 
 
@@ -551,7 +551,7 @@ def test_a_full_disk_leaves_the_file_as_it_was(opened: Opened, tmp_path: Path) -
     assert stored.count == 0
 
 
-def refuse_removals(stored: Stored) -> None:
+def refuse_removals(stored: BufferFile) -> None:
     """As on a full disk: a removal has to write a journal first."""
     stored._db.execute(
         "CREATE TRIGGER full BEFORE DELETE ON readings BEGIN SELECT RAISE(ABORT, 'is full'); END"
@@ -568,7 +568,7 @@ def test_a_file_that_was_removed_is_written_anew_with_all_that_waits(
     buffer.stored = opened(file)
     for number in range(4):
         buffer.offer(polls(1, number))
-        buffer.keep(60)
+        buffer.move_to_file(60)
     assert numbers(buffer.take(1, 0)) == [0]
     buffer.done()
     assert numbers(buffer.take(1, 0)) == [1]
@@ -579,7 +579,7 @@ def test_a_file_that_was_removed_is_written_anew_with_all_that_waits(
     assert (buffer.stored.is_in_place, buffer.stored.count, len(buffer)) == (True, 3, 3)
     buffer.done()
     buffer.offer(polls(1, 4))
-    buffer.keep(60)
+    buffer.move_to_file(60)
     buffer.detach()
     assert [each.name for each in tmp_path.iterdir()] == ["b.db"]
     again = Buffer()
@@ -654,7 +654,7 @@ def test_a_file_goes_as_a_whole_if_all_is_sent_and_nothing_can_be_removed(
     buffer = Buffer()
     buffer.stored = opened(tmp_path / "b.db")
     buffer.offer(polls(3))
-    buffer.keep(60)
+    buffer.move_to_file(60)
     refuse_removals(buffer.stored)
     assert numbers(buffer.take(3, 0)) == [0, 1, 2]
     with pytest.raises(FileGone, match="is full"):
@@ -706,10 +706,10 @@ def test_a_batch_that_the_file_has_dropped_takes_no_other_with_it(
     buffer.stored = opened(tmp_path / "b.db", max_bytes=250)
     for start in range(0, 8, 4):
         buffer.offer(polls(4, start))
-        buffer.keep(60)
+        buffer.move_to_file(60)
     assert numbers(buffer.take(4, 0)) == [0, 1, 2, 3]
     buffer.offer(polls(4, 8))
-    buffer.keep(60)
+    buffer.move_to_file(60)
     assert buffer.dropped == 4
     assert drained(buffer) == list(range(12))
 
@@ -844,9 +844,9 @@ def test_nothing_is_lost_or_reordered(
             sent += numbers(buffer.take(2, 0))
             buffer.done()
         elif step == "keep":
-            buffer.keep(60, 2)
+            buffer.move_to_file(60, 2)
         else:
-            buffer.keep(60, 2)
+            buffer.move_to_file(60, 2)
             buffer.detach()
             buffer.stored = opened(file)
     sent += drained(buffer)

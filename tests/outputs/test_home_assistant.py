@@ -9,7 +9,7 @@ import pytest
 
 from holdfast.config.models.devices import DeviceIdentityConfig
 from holdfast.config.models.outputs import MqttOutputConfig
-from holdfast.outputs import sending
+from holdfast.outputs import sender
 from holdfast.outputs.device_access import DeviceInfo
 from holdfast.outputs.mqtt.home_assistant import Discovery
 from holdfast.outputs.mqtt.messages import Payloads
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
-        monkeypatch.setattr(sending, name, 0.05)
+        monkeypatch.setattr(sender, name, 0.05)
 
 
 @pytest.fixture

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.config.models.outputs import InfluxConfig
-from holdfast.outputs import Buffer, Refused, Sending
-from holdfast.outputs import sending as module
-from holdfast.outputs.buffer_file import Stored
+from holdfast.outputs import Buffer, OutputSender, Refused
+from holdfast.outputs import sender as module
+from holdfast.outputs.buffer_file import BufferFile
 from holdfast.outputs.influx import Influx
 from holdfast.runtime.stop import Stop
 from support import wire
@@ -374,9 +374,9 @@ def test_a_receiver_that_never_answers_does_not_hold_up_a_stop(
         output = influx(url, bucket="b", timeout=3600)
         buffer, stop = Buffer(), Stop()
         find = {"t": tag()}
-        opened = Stored(tmp_path / "b.db", 2**30, lambda _, name: find[name])
-        sending = Sending("db", output, buffer, lambda: opened)
-        thread = threading.Thread(target=sending.run, args=[stop])
+        opened = BufferFile(tmp_path / "b.db", 2**30, lambda _, name: find[name])
+        sender = OutputSender("db", output, buffer, lambda: opened)
+        thread = threading.Thread(target=sender.run, args=[stop])
         thread.start()
         buffer.offer(polls(3))
         connection, _ = listener.accept()
@@ -385,6 +385,6 @@ def test_a_receiver_that_never_answers_does_not_hold_up_a_stop(
             stop.set()
             thread.join(wire.DEADLINE)
             assert not thread.is_alive()
-    stored = Stored(tmp_path / "b.db", 2**30, lambda _, name: find[name])
+    stored = BufferFile(tmp_path / "b.db", 2**30, lambda _, name: find[name])
     assert [each.value for each in stored.first(1)] == [0, 1, 2]
     stored.close()

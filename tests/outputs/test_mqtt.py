@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.outputs import sending
+from holdfast.outputs import sender
 from holdfast.outputs.mqtt import session
 from support import wire
 from support.certificates import Certificates
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
-        monkeypatch.setattr(sending, name, 0.05)
+        monkeypatch.setattr(sender, name, 0.05)
 
 
 @pytest.fixture
@@ -283,7 +283,7 @@ def test_a_refused_message_is_counted_and_the_others_are_published(tmp_path: Pat
 def test_what_was_refused_is_published_once_the_broker_accepts_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, payload: str, topic: str
 ) -> None:
-    monkeypatch.setattr(sending, "RENEWAL_INTERVAL_S", 0.05)
+    monkeypatch.setattr(sender, "RENEWAL_INTERVAL_S", 0.05)
     rules = tmp_path / "acl"
     rules.write_text("topic read #\n")
     with Plant(tmp_path, "allow_anonymous true", f"acl_file {rules}") as plant:
@@ -306,7 +306,7 @@ def test_what_was_refused_is_published_once_the_broker_accepts_it(
 def test_only_the_entity_that_was_refused_is_published_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sending, "RENEWAL_INTERVAL_S", 0.05)
+    monkeypatch.setattr(sender, "RENEWAL_INTERVAL_S", 0.05)
     own, rules = "homeassistant/{}/holdfast_home/pump-{}/config", tmp_path / "acl"
     rules.write_text(f"topic readwrite #\ntopic deny {own.format('sensor', 'address')}\n")
     with Plant(tmp_path, "allow_anonymous true", f"acl_file {rules}") as plant:
@@ -323,7 +323,7 @@ def test_only_the_entity_that_was_refused_is_published_again(
 def test_a_removal_that_was_refused_is_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sending, "RENEWAL_INTERVAL_S", 0.05)
+    monkeypatch.setattr(sender, "RENEWAL_INTERVAL_S", 0.05)
     rules = tmp_path / "acl"
     rules.write_text("topic readwrite #\n")
     output: dict[str, Any] = {"discovery": "homeassistant"}

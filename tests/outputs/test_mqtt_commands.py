@@ -16,7 +16,7 @@ from holdfast.appliance.parts import tag_writes
 from holdfast.appliance.parts.tag_writes import TagWrites
 from holdfast.appliance.services.outputs import _Site
 from holdfast.events.audit.refusal_summaries import WHOLE_WRITES
-from holdfast.outputs import sending
+from holdfast.outputs import sender
 from holdfast.outputs.device_access import NotWritten
 from holdfast.outputs.mqtt import commands
 from holdfast.polling.faults import STANDBY, fault_word
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
-        monkeypatch.setattr(sending, name, 0.05)
+        monkeypatch.setattr(sender, name, 0.05)
 
 
 @pytest.fixture

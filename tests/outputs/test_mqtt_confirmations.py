@@ -15,7 +15,7 @@ import pytest
 from holdfast.config.models.outputs import MqttOutputConfig
 from holdfast.net.mqtt.packet_splitter import PacketSplitter
 from holdfast.net.mqtt.packets import parse_publish
-from holdfast.outputs import sending
+from holdfast.outputs import sender
 from holdfast.outputs.mqtt import MqttOutput, session
 from holdfast.runtime.stop import Stop
 from support import wire
@@ -82,7 +82,7 @@ class Broker:
 class Site:
     """A site without devices."""
 
-    revision = answers = 0
+    revision = answering_revision = 0
 
     def __init__(self) -> None:
         self.refreshed = 0
@@ -134,7 +134,7 @@ class Pump(Site):
         self.is_answering, self.is_ending = True, False
 
     @property
-    def answers(self) -> int:  # type: ignore[override]
+    def answering_revision(self) -> int:  # type: ignore[override]
         found = 1 if self.is_answering else 2
         self.is_answering = self.is_answering and not self.is_ending
         return found
@@ -315,7 +315,7 @@ def test_a_broker_that_confirms_slowly_holds_no_stop(
 ) -> None:
     """What is left must be stored in time: confirmations do not extend the wait."""
     monkeypatch.setattr(session, "STOP_TIMEOUT_S", inf)
-    monkeypatch.setattr(sending, "STOP_TIMEOUT_S", 0.0)
+    monkeypatch.setattr(sender, "STOP_TIMEOUT_S", 0.0)
     with FakeBroker() as broker, ThreadPoolExecutor(1) as threads:
         output = made(broker, Site(), stop)
         sent = threads.submit(output.send, numbered(2))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import pytest
 
-from holdfast.outputs import sending
+from holdfast.outputs import sender
 from support import wire
 from support.machine import tool
 from support.mqtt_plant import Plant
@@ -41,7 +41,7 @@ def plant(tmp_path: Path) -> Iterator[Plant]:
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
-        monkeypatch.setattr(sending, name, 0.05)
+        monkeypatch.setattr(sender, name, 0.05)
 
 
 class Message(msgspec.Struct):

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.net.mqtt import client
-from holdfast.outputs import sending
-from holdfast.outputs.mqtt import connection, late_commands
+from holdfast.outputs import sender
+from holdfast.outputs.mqtt import connection, pings
 from holdfast.outputs.mqtt.connection import MAX_PAYLOAD_BYTES
 from holdfast.outputs.mqtt.receiver import default_client_id
 from holdfast.outputs.sparkplug.definition import Payload
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
-        monkeypatch.setattr(sending, name, 0.05)
+        monkeypatch.setattr(sender, name, 0.05)
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def plant(tmp_path: Path) -> Iterator[Plant]:
 @pytest.fixture(params=["5", "3.1.1"])
 def fake(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeBroker]:
     # It answers pings only while a test looks at its packets.
-    monkeypatch.setattr(late_commands, "MAX_COMMAND_AGE_S", 60)
+    monkeypatch.setattr(pings, "MAX_COMMAND_AGE_S", 60)
     with FakeBroker(request.param) as broker:
         yield broker
 
@@ -187,7 +187,7 @@ def test_a_command_that_waited_while_the_network_stood_still_is_not_carried_out(
     plant: Plant, fake: FakeBroker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(connection, "PING_INTERVAL_S", 0.05)
-    monkeypatch.setattr(late_commands, "MAX_COMMAND_AGE_S", 0.2)
+    monkeypatch.setattr(pings, "MAX_COMMAND_AGE_S", 0.2)
     valve = plant.device().memory
     topic = "plant/pump/valve/set"
     late = mqtt.publish(topic, "true", 1, 7, version=fake.version)
@@ -201,7 +201,7 @@ def test_a_command_that_waited_while_the_network_stood_still_is_not_carried_out(
         peer.send(late)
         until(peer, mqtt.PUBACK, b"\0\x07")
         wire.until(lambda: plant.status()["commands"]["ignored"] == 1, "it is ignored")
-        monkeypatch.setattr(late_commands, "MAX_COMMAND_AGE_S", inf)
+        monkeypatch.setattr(pings, "MAX_COMMAND_AGE_S", inf)
         peer.send(mqtt.publish(topic, "false", 1, 8, version=fake.version))
         until(peer, mqtt.PUBLISH, b"accepted")
     assert plant.status()["commands"]["written"] == 1

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import pytest
 
 from holdfast.net.nats.connection import Servers
-from holdfast.outputs import Buffer, Sending
-from holdfast.outputs import sending as module
-from holdfast.outputs.sending import Refused
+from holdfast.outputs import Buffer, OutputSender
+from holdfast.outputs import sender as module
+from holdfast.outputs.sender import Refused
 from holdfast.polling.faults import NO_CONNECTION
 from holdfast.runtime.stop import Stop
 from holdfast.scanner.publish import nats_output as output_module
@@ -100,8 +100,8 @@ def test_nothing_is_lost_when_the_server_is_away(
     for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
         monkeypatch.setattr(module, name, 0.05)
     buffer, stop = Buffer(), Stop()
-    sending = Sending("nats", output, buffer)
-    thread = threading.Thread(target=sending.run, args=[stop])
+    sender = OutputSender("nats", output, buffer)
+    thread = threading.Thread(target=sender.run, args=[stop])
     thread.start()
     try:
         with Caller(own_nats.url) as caller:
@@ -110,7 +110,7 @@ def test_nothing_is_lost_when_the_server_is_away(
             assert [inbox.next()["value"] for _ in range(3)] == [0, 1, 2]
         own_nats.kill()
         buffer.offer(polls(2000, 3))
-        wire.until(lambda: sending.status()["connected"] is False, "the server is missed")
+        wire.until(lambda: sender.status()["connected"] is False, "the server is missed")
         own_nats.start()
         with Caller(own_nats.url) as caller:
             inbox = caller.listen("modbus.data.pump")
@@ -124,7 +124,7 @@ def test_nothing_is_lost_when_the_server_is_away(
         thread.join(wire.DEADLINE)
     # What came before the listener is not seen: NATS keeps nothing without a stream.
     assert found == list(range(found[0], 2004))
-    assert sending.status()["readings"] == {"sent": 2004, "refused": 0, "dropped": 0}
+    assert sender.status()["readings"] == {"sent": 2004, "refused": 0, "dropped": 0}
 
 
 @pytest.mark.parametrize(
@@ -196,11 +196,11 @@ def test_a_frozen_server_does_not_hold_up_a_stop(
     monkeypatch.setattr(output_module, "CONFIRM_TIMEOUT_S", 3600.0)
     output = NatsOutput(Servers((own_nats.url,)), "modbus", "tentacle")
     buffer, stop = Buffer(), Stop()
-    sending = Sending("nats", output, buffer, is_followed=lambda: True)
-    thread = threading.Thread(target=sending.run, args=[stop])
+    sender = OutputSender("nats", output, buffer, is_followed=lambda: True)
+    thread = threading.Thread(target=sender.run, args=[stop])
     thread.start()
     buffer.offer(polls(1))
-    counted = sending.status
+    counted = sender.status
     wire.until(lambda: "'sent': 1" in str(counted()["readings"]), "it is connected")
     own_nats.freeze()
     buffer.offer(polls(1))

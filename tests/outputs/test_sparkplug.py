@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.outputs import sending
+from holdfast.outputs import sender
 from holdfast.outputs.mqtt import session
 from holdfast.outputs.sparkplug import primary_host
 from support import wire
@@ -25,7 +25,7 @@ REBIRTH: dict[str, Any] = {"name": "Node Control/Rebirth", "datatype": 11, "bool
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
-        monkeypatch.setattr(sending, name, 0.05)
+        monkeypatch.setattr(sender, name, 0.05)
     monkeypatch.setattr(primary_host, "HOST_STATE_TIMEOUT_S", 0.05)
 
 

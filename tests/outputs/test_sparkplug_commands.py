@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.appliance import Appliance
-from holdfast.outputs import sending
+from holdfast.outputs import sender
 from support import wire
 from support.audits import lines
 from support.mqtt_plant import TAGS, Plant
@@ -55,7 +55,7 @@ MORE: dict[str, Any] = {
 @pytest.fixture(autouse=True)
 def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
-        monkeypatch.setattr(sending, name, 0.05)
+        monkeypatch.setattr(sender, name, 0.05)
 
 
 @pytest.fixture

@@ -508,7 +508,7 @@ def test_a_birth_has_no_value_from_before_a_change_of_its_tag() -> None:
 class Pump:
     """A site with one device, which answers."""
 
-    revision = answers = 0
+    revision = answering_revision = 0
     retained: ClassVar[dict[tuple[str, str], str]] = {}
     standby: frozenset[str] = frozenset()
 

@@ -14,7 +14,7 @@ from holdfast.outputs.buffer_file_error import FileGone
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from holdfast.outputs.buffer_file import Stored
+    from holdfast.outputs.buffer_file import BufferFile
     from holdfast.polling import Reading
 
 
@@ -50,7 +50,7 @@ class Buffer:
         self._is_batch_stored = False
         self._changed = threading.Condition()
         self._is_woken = False
-        self.stored: Stored | None = None
+        self.stored: BufferFile | None = None
         self.dropped: int = 0 if before is None else before.dropped
         """Readings that were lost because there was no room."""
         self._dropped_before = self.dropped
@@ -179,7 +179,7 @@ class Buffer:
         with self._losing_file():
             return self.stored is not None and self.stored.restore()
 
-    def keep(self, seconds: float, step: int = MAX_STEP) -> bool:
+    def move_to_file(self, seconds: float, step: int = MAX_STEP) -> bool:
         """Moves what waits in memory now to the file, if there is one, `step` at a time. Returns
         whether anything was moved.
 

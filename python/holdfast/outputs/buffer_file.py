@@ -15,7 +15,7 @@ from zlib import crc32
 import msgspec
 
 from holdfast.outputs.buffer_file_error import FileGone
-from holdfast.outputs.tag_meaning import described, tag_from
+from holdfast.outputs.tag_meaning import definition_text, tag_from
 from holdfast.polling import Reading
 from holdfast.tags import Tag
 
@@ -55,7 +55,7 @@ class _Damage(sqlite3.DatabaseError):
     sqlite_errorcode = sqlite3.SQLITE_CORRUPT
 
 
-class Stored:
+class BufferFile:
     """Readings in a file, oldest first. For one thread. Methods raise `OSError`.
 
     `max_bytes` bounds the readings, not the file, which is a little larger.
@@ -143,7 +143,7 @@ class Stored:
         dropped = 0
         # Once for each tag: most readings share theirs.
         tags = {id(reading.tag): reading.tag for row in rows for reading in row}
-        texts = {of: described(tag) for of, tag in tags.items()}
+        texts = {of: definition_text(tag) for of, tag in tags.items()}
         meanings = {of: crc32(text.encode()) for of, text in texts.items()}
         new = {
             meanings[of]: text for of, text in texts.items() if meanings[of] not in self._described
@@ -322,7 +322,7 @@ class Stored:
         """A reading that `add` has stored. Raises `TypeError` or `ValueError` for anything else."""
         device, name, value, time, fault, undecoded, meaning = plain
         tag = self._find(device, name)
-        if tag is None or meaning != crc32(described(tag).encode()):
+        if tag is None or meaning != crc32(definition_text(tag).encode()):
             tag = self._as_stored(name, meaning)
         return Reading(device, tag, value, time, fault, undecoded)
 

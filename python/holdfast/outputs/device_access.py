@@ -46,8 +46,8 @@ class Site(Protocol):
         """Changes with the tags of any device, and with `devices`."""
 
     @property
-    def answers(self) -> int:
-        """Changes when a device stops to answer, or answers again."""
+    def answering_revision(self) -> int:
+        """Changes when a device stops answering, or answers again."""
 
     def tags(self) -> Mapping[str, Sequence[Tag]]:
         """The tags of each device."""

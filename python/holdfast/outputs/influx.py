@@ -18,7 +18,7 @@ from holdfast.net.addresses import joined
 from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, https_context
 from holdfast.outputs.line_protocol import lines
-from holdfast.outputs.sending import MAX_READINGS, Receiver, Refused, soon_after
+from holdfast.outputs.sender import MAX_READINGS, Receiver, Refused, soon_after
 
 if TYPE_CHECKING:
     from holdfast.config.models.outputs import InfluxConfig

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.outputs.buffer_file import file_errors, is_in_place
-from holdfast.outputs.sending import Receiver
+from holdfast.outputs.sender import Receiver
 from holdfast.outputs.text_file import row
 
 if TYPE_CHECKING:

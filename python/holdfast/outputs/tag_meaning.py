@@ -15,8 +15,8 @@ def meaning_of(tag: Tag) -> int:
     return crc32(f"{tag.type} {tag.scale} {tag.offset} {tag.unit} {states}".encode())
 
 
-def described(tag: Tag) -> str:
-    """The same as text, and the area: `tag_from` makes a tag of it."""
+def definition_text(tag: Tag) -> str:
+    """What values of a tag need to be shown, and its area, as text for `tag_from`."""
     scale: object = tag.scale
     if isinstance(scale, RegisterScale):
         scale = scale.form, scale.name or scale.where
@@ -24,7 +24,7 @@ def described(tag: Tag) -> str:
 
 
 def tag_from(name: str, text: str | bytes) -> Tag:
-    """A tag of the same meaning as one that was described, for values that were read."""
+    """A tag with a definition as `definition_text` returns it, for values that were read."""
     area, type, scale, offset, unit, states = json.loads(text)
     if isinstance(scale, list):
         scale = RegisterScale(*scale)

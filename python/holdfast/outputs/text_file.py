@@ -14,7 +14,7 @@ from holdfast.config.models.outputs import MEASUREMENT
 from holdfast.events import log_lines
 from holdfast.events.rotation import Rotation
 from holdfast.outputs.line_protocol import lines
-from holdfast.outputs.sending import Receiver
+from holdfast.outputs.sender import Receiver
 from holdfast.tags.csv_text import csv_lines
 from holdfast.tags.text import plain, text_of
 

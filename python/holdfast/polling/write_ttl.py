@@ -3,5 +3,5 @@
 from __future__ import annotations
 
 WRITE_TTL_S = 10.0
-"""Seconds that a write may wait to be sent; one timeout of its device is added. Later, nobody
-expects it any more."""
+"""Seconds that a write may wait until it is sent; the poller adds one timeout of the device. Later,
+nobody expects it any more."""

@@ -20,7 +20,7 @@ from holdfast.appliance.parts.native_links import destination
 from holdfast.client.url import NetworkTarget
 from holdfast.config.models.devices import DeviceIdentityConfig
 from holdfast.events import log_lines
-from holdfast.outputs import Buffer, Changes, Sending, log_unsent
+from holdfast.outputs import Buffer, Changes, OutputSender, log_unsent
 from holdfast.outputs.device_access import DeviceInfo
 from holdfast.outputs.line_protocol import has_field
 from holdfast.polling import Reading
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from holdfast.config.models.devices import DeviceConfig
     from holdfast.config.models.outputs import Output
     from holdfast.outputs import Receiver
-    from holdfast.outputs.buffer_file import Stored
+    from holdfast.outputs.buffer_file import BufferFile
     from holdfast.polling import DevicePoll
     from holdfast.tags import Tag
     from holdfast.types import PolledBlock, ThreadHeartbeat
@@ -255,17 +255,17 @@ class TagValues:
             log_unsent(name, output.buffer)
         return changed & tagged.keys()
 
-    def sending(self, name: str, receiver: Callable[[], Receiver]) -> Sending:
+    def sending(self, name: str, receiver: Callable[[], Receiver]) -> OutputSender:
         """The adapter of an output."""
         output = self._outputs[name]
         settings = output.settings.buffer
         file = settings.file
 
-        def opened() -> Stored:
-            from holdfast.outputs.buffer_file import Stored
+        def opened() -> BufferFile:
+            from holdfast.outputs.buffer_file import BufferFile
 
             assert file is not None, "called only with a file"
-            return Stored(file, settings.max_bytes, self.find)
+            return BufferFile(file, settings.max_bytes, self.find)
 
         def leaves() -> bool:
             return all(each.settings.buffer.file != file for each in self._outputs.values())
@@ -273,7 +273,7 @@ class TagValues:
         def is_followed() -> bool:
             return name in self._outputs and not self._stopping.is_set()
 
-        return Sending(
+        return OutputSender(
             name,
             receiver(),
             output.buffer,

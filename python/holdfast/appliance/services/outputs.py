@@ -62,7 +62,7 @@ class _Site:
         return self._values.revision
 
     @property
-    def answers(self) -> int:
+    def answering_revision(self) -> int:
         return self._values.answers
 
     def tags(self) -> dict[str, tuple[Tag, ...]]:

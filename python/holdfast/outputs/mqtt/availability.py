@@ -28,8 +28,8 @@ class Availability:
         self._names, self._site, self._retain = names, site, retain
         self._answering: dict[str, bool] = {}
         """Of each device, whether it answered when that was published last."""
-        self._answers = -1
-        """The number of answers of the site at which all was published."""
+        self._answering_revision = -1
+        """That of the site when all was published."""
         self._is_due = threading.Event()
         """Set until `ONLINE` of the output is published, for the first time or again."""
         self._repeated_at = -inf
@@ -57,7 +57,7 @@ class Availability:
 
     def begin(self) -> None:
         """Forgets what was published: a broker may have lost it."""
-        self._answering, self._answers = {}, -1
+        self._answering, self._answering_revision = {}, -1
         self._repeated_at = -inf
         self._is_due.set()
 
@@ -68,10 +68,10 @@ class Availability:
         for device in [*self._answering]:
             if self._names.of_availability(device) in topics:
                 del self._answering[device]
-                self._answers = -1
+                self._answering_revision = -1
 
-    def keep(self, devices: Set[str]) -> None:
-        """Forgets all other devices."""
+    def forget_except(self, devices: Set[str]) -> None:
+        """Forgets all devices but these."""
         for device in self._answering.keys() - devices:
             del self._answering[device]
 
@@ -80,8 +80,8 @@ class Availability:
 
         Those of devices that have stopped belong before values, the others after them.
         """
-        now = self._site.answers
-        if now == self._answers:
+        now = self._site.answering_revision
+        if now == self._answering_revision:
             return []
         found = self._site.answering()
         changed = [
@@ -92,7 +92,7 @@ class Availability:
         self._answering.update(dict.fromkeys(changed, answering))
         # A device that has just stopped answering is for the next call, before its values.
         if all(self._answering.get(device) is answers for device, answers in found.items()):
-            self._answers = now
+            self._answering_revision = now
         payload = ONLINE if answering else OFFLINE
         topics = map(self._names.of_availability, changed)
         return [Message(packed_topic(topic), payload, self._retain) for topic in topics]

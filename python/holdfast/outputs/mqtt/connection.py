@@ -27,7 +27,7 @@ from holdfast.net.mqtt.client import BrokerClient
 from holdfast.net.mqtt.packet_splitter import PacketSplitter
 from holdfast.net.mqtt.packets import MAX_HEAD_BYTES, acknowledgement, parse_publish
 from holdfast.outputs.mqtt.delivery import MAX_IN_FLIGHT, Message, packed, size_of
-from holdfast.outputs.mqtt.late_commands import PING_INTERVAL_S, Pings
+from holdfast.outputs.mqtt.pings import PING_INTERVAL_S, Pings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -72,17 +72,18 @@ class Connection(BrokerClient):
         on_refused: Callable[[Message, str], None],
         *,
         qos: int,
-        writes: bool,
-        proves: bool,
+        takes_commands: bool,
+        confirms_by_ping: bool,
     ) -> None:
-        """`writes`: messages are commands, and must not be late.
+        """`takes_commands`: messages are commands, and must not be late.
 
-        `proves`: with a quality of service of 0, messages count as confirmed when the broker has
-        answered a ping that follows them; otherwise, when they are written.
+        `confirms_by_ping`: with a quality of service of 0, messages count as confirmed when the
+        broker has answered a ping that follows them; otherwise, when they are written.
         """
         super().__init__(settings, client_id, waiter, session_expiry=0)
         self._on_command, self._on_refused = on_command, on_refused
-        self._qos, self._writes, self._proves = qos, writes, proves
+        self._qos, self._takes_commands = qos, takes_commands
+        self._confirms_by_ping = confirms_by_ping
         self._max_in_flight = MAX_IN_FLIGHT[settings.version]
         self._largest: int | None = None
         self._retains = True
@@ -155,7 +156,7 @@ class Connection(BrokerClient):
             news |= self._send(delivery, self._max_in_flight - len(self._in_flight))
             if delivery.sent == len(delivery.messages):
                 self._waiting.popleft()
-        if self._written and self._proves:
+        if self._written and self._confirms_by_ping:
             if not self._pings.is_waiting:
                 self._ping()
         elif self._written and not self.connection.unsent:
@@ -171,13 +172,13 @@ class Connection(BrokerClient):
         seconds = self._pings.age()
         keep_alive = self.keepalive or inf  # The broker may have set it to 0, which is none.
         if not self._pings.is_waiting:
-            if seconds >= min(keep_alive, PING_INTERVAL_S if self._writes else inf):
+            if seconds >= min(keep_alive, PING_INTERVAL_S if self._takes_commands else inf):
                 self._ping()
         elif seconds >= keep_alive:
             self.end(f"the broker did not answer a ping within {keep_alive} s")
 
     def _ping(self) -> None:
-        if self._proves:
+        if self._confirms_by_ping:
             self._pinged, self._written = self._written, []
         self._pings.sent()
         self.connection.send_to_broker(_PING)
@@ -280,7 +281,7 @@ class Connection(BrokerClient):
 
     def _received(self, first: int, body: bytes | bytearray, size: int) -> None:
         message = parse_publish(first, body, size, five=self._five)
-        if self._writes:
+        if self._takes_commands:
             message = message._replace(lateness=self._pings.lateness())
         if message.qos == 1:
             self.connection.send_to_broker(acknowledgement(PUBACK, message.identifier))

@@ -62,7 +62,7 @@ class Payloads:
             else:
                 self._known[device] = known
 
-    def keep_only(self, tags: dict[str, set[str]]) -> None:
+    def restrict_to(self, tags: dict[str, set[str]]) -> None:
         """Forgets all other devices and tags, also those of the last `messages`."""
         self._tags = tags
         self._topics.clear()

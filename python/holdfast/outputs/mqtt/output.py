@@ -9,7 +9,7 @@ from math import inf
 from typing import TYPE_CHECKING
 
 from holdfast.config.values.mqtt_output_topics import DEFAULT_STATUS
-from holdfast.outputs import sending
+from holdfast.outputs import sender
 from holdfast.outputs.mqtt.availability import OFFLINE, ONLINE, Availability
 from holdfast.outputs.mqtt.commands import Commands
 from holdfast.outputs.mqtt.delivery import Message, packed_topic, unpacked_topic
@@ -17,7 +17,7 @@ from holdfast.outputs.mqtt.home_assistant import Discovery
 from holdfast.outputs.mqtt.messages import Payloads
 from holdfast.outputs.mqtt.receiver import BrokerReceiver
 from holdfast.outputs.mqtt.session import Session
-from holdfast.outputs.sending import Refused
+from holdfast.outputs.sender import Refused
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence, Set
@@ -55,7 +55,7 @@ class MqttOutput(BrokerReceiver):
         self._discovery = None if settings.discovery is None else Discovery(name, settings)
         self._entities: dict[str, bytes] = {}
         self._found: deque[str] = deque()
-        self._is_born = threading.Event()
+        self._discovery_requested = threading.Event()
         self._has_sent = True
         """Whether the broker has confirmed values since all were offered again."""
         self._refused: dict[bytes, str] = {}
@@ -119,7 +119,7 @@ class MqttOutput(BrokerReceiver):
             self._on_refused,
             stop,
             qos=self._settings.qos,
-            writes=self._settings.writes,
+            takes_commands=self._settings.writes,
         )
 
     def _greet(self, session: Session) -> None:
@@ -149,8 +149,8 @@ class MqttOutput(BrokerReceiver):
             self._revision = revision
             self._adopt(session, self._site.tags())
         if self._discovery is not None:
-            if self._is_born.is_set():
-                self._is_born.clear()
+            if self._discovery_requested.is_set():
+                self._discovery_requested.clear()
                 self._publish(session, self._entities)
             self._remove_stale(session)
         self._repeat_lost(session)
@@ -164,13 +164,13 @@ class MqttOutput(BrokerReceiver):
             # What waits for its confirmation may be of tags that are gone: it is made again.
             self._payloads.settle(sent=False)
             self._taken, self._messages = [], ()
-            self._payloads.keep_only(names)
+            self._payloads.restrict_to(names)
         self._tags = names
         before = self._entities
         if self._discovery is not None:
             self._entities = self._discovery.entities(tags, self._site.devices())
         self._remove_gone(session)
-        self._availability.keep(names.keys())
+        self._availability.forget_except(names.keys())
         if self._discovery is None:
             return
         if not before:
@@ -219,7 +219,7 @@ class MqttOutput(BrokerReceiver):
         """
         if not self._lost or self._removal is not None:
             return
-        if (now := time.monotonic()) < self._renewed_at + sending.RENEWAL_INTERVAL_S:
+        if (now := time.monotonic()) < self._renewed_at + sender.RENEWAL_INTERVAL_S:
             return
         lost, self._lost, self._renewed_at = self._lost, set(), now
         self._availability.forget(lost)
@@ -296,6 +296,6 @@ class MqttOutput(BrokerReceiver):
             return
         if message.topic == self._discovery.birth_topic:
             if message.payload == ONLINE and not message.is_retained:
-                self._is_born.set()
+                self._discovery_requested.set()
         elif message.is_retained and message.payload and self._discovery.owns(message.topic):
             self._found.append(message.topic)

@@ -11,7 +11,7 @@ from holdfast.events import log_lines
 from holdfast.net.addresses import joined
 from holdfast.net.mqtt.client import ClientId
 from holdfast.outputs.mqtt.delivery import unpacked_topic
-from holdfast.outputs.sending import Receiver
+from holdfast.outputs.sender import Receiver
 
 if TYPE_CHECKING:
     from holdfast.config.models.outputs import MqttOutputConfig, SparkplugConfig

@@ -16,7 +16,7 @@ from holdfast.events import log_lines
 from holdfast.net.mqtt.dial import CONNACK_TIMEOUT_S
 from holdfast.net.mqtt.selector import Ended, Waiter
 from holdfast.net.secure_channel import failure_text
-from holdfast.outputs import sending
+from holdfast.outputs import sender
 from holdfast.outputs.mqtt.connection import Connection
 from holdfast.outputs.mqtt.delivery import Delivery, Message, unpacked_topic
 from holdfast.runtime.standstill import MAX_LOOK_INTERVAL_S, Standstill
@@ -64,18 +64,18 @@ class Session:
         *,
         qos: int,
         will_qos: int | None = None,
-        writes: bool,
-        proves: bool = False,
+        takes_commands: bool,
+        confirms_by_ping: bool = False,
     ) -> None:
         """`qos` is of all messages, and of the will unless it has its own. For `on_refused` and
-        `proves`, see `Connection`.
+        `confirms_by_ping`, see `Connection`.
 
-        With `writes`, messages are commands. If this process stood still, the connection ends, and
-        the broker drops the commands that waited: they are too late.
+        With `takes_commands`, messages are commands. If this process stood still, the connection
+        ends, and the broker drops the commands that waited: they are too late.
         """
-        self._standstill = Standstill("output") if writes else None
+        self._standstill = Standstill("output") if takes_commands else None
         self._on_command, self._on_refused = on_command, on_refused
-        self._settings, self._qos, self._proves = settings, qos, proves
+        self._settings, self._qos, self._confirms_by_ping = settings, qos, confirms_by_ping
         self._will_qos = qos if will_qos is None else will_qos
         self._ending = Ending.DISCONNECT
         self._stop, self._end = stop, Stop()
@@ -132,7 +132,7 @@ class Session:
                 if delivery.confirmed != confirmed:
                     confirmed, since = delivery.confirmed, now
                 limit = STOP_TIMEOUT_S if self._stop.is_set() else CONFIRM_TIMEOUT_S
-                if now > min(since + limit, self._stop.at + sending.STOP_TIMEOUT_S):
+                if now > min(since + limit, self._stop.at + sender.STOP_TIMEOUT_S):
                     raise TimeoutError("the broker did not confirm all messages in time")
 
     def close(self, last: Sequence[Message] = (), *, with_will: bool = False) -> None:
@@ -165,8 +165,8 @@ class Session:
                 self._take,
                 self._on_refused,
                 qos=self._qos,
-                writes=self._standstill is not None,
-                proves=self._proves,
+                takes_commands=self._standstill is not None,
+                confirms_by_ping=self._confirms_by_ping,
             )
             undo.callback(connection.close)
             connection.on_disconnect = self._on_disconnect

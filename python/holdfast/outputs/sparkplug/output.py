@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from holdfast.events import log_lines
 from holdfast.outputs.mqtt.receiver import BrokerReceiver
 from holdfast.outputs.mqtt.session import Session
-from holdfast.outputs.sending import Refused
+from holdfast.outputs.sender import Refused
 from holdfast.outputs.sparkplug.commands import Commands
 from holdfast.outputs.sparkplug.node import EdgeNode, Names, state_topic
 from holdfast.outputs.sparkplug.primary_host import PrimaryHost
@@ -33,7 +33,7 @@ class SparkplugOutput(BrokerReceiver):
         self._node = EdgeNode(self._names, always_typed=settings.datatypes == "always")
         self._commands = Commands(name, self._broker, site, self._node.find, writes=settings.writes)
         self._primary = None if settings.primary_host is None else PrimaryHost()
-        self._is_born = False
+        self._has_published_births = False
         self._births = 0
 
     def send(self, readings: list[Reading]) -> None:
@@ -65,7 +65,7 @@ class SparkplugOutput(BrokerReceiver):
             **super().status(),
             "group": self._settings.group,
             "edge_node": self._settings.edge_node,
-            "born": self._is_born,
+            "born": self._has_published_births,
             "births": self._births,
             "commands_written": self._commands.written,
             "commands_refused": self._commands.refused,
@@ -79,11 +79,11 @@ class SparkplugOutput(BrokerReceiver):
         """The session, after all births that are due. Raises `OSError`."""
         session = self._connected()
         if self._primary is not None and not self._primary.is_online:
-            if self._is_born:
+            if self._has_published_births:
                 self._disconnect()
             raise ConnectionError(f"the primary host {self._settings.primary_host} is offline")
         revision, answering = self._site.revision, self._site.answering()
-        if revision != self._revision or not self._is_born:
+        if revision != self._revision or not self._has_published_births:
             self._adopt(session)
             self._revision = revision
             self._commands.rebirth.set()
@@ -91,7 +91,7 @@ class SparkplugOutput(BrokerReceiver):
             self._commands.rebirth.clear()
             self._births += 1
             self._publish(session, self._node.births(answering, self._latest))
-            self._is_born = True
+            self._has_published_births = True
         else:
             self._publish(session, self._node.device_births(answering, self._latest))
         return session
@@ -109,8 +109,8 @@ class SparkplugOutput(BrokerReceiver):
             stop,
             qos=0,
             will_qos=1,
-            writes=self._settings.writes,
-            proves=True,
+            takes_commands=self._settings.writes,
+            confirms_by_ping=True,
         )
 
     def _greet(self, session: Session) -> None:
@@ -143,7 +143,7 @@ class SparkplugOutput(BrokerReceiver):
 
     def _disconnect(self) -> None:
         session, self._session = self._session, None
-        self._is_born = False
+        self._has_published_births = False
         if session is not None:
             session.close([self._node.death()], with_will=True)
 

@@ -15,7 +15,7 @@ from nats.errors import Error
 from holdfast.net.event_loop import EventLoop
 from holdfast.net.nats.connection import MAX_PENDING_BYTES, nats_reason
 from holdfast.net.nats.tolerant_client import SafeClient, ServerError, as_quoted
-from holdfast.outputs.sending import Receiver, Refused, soon_after
+from holdfast.outputs.sender import Receiver, Refused, soon_after
 from holdfast.polling.faults import fault_text, is_exception
 from holdfast.scanner.dialects import DIALECTS
 from holdfast.scanner.messages.types import Data, Status

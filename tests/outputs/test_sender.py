@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from holdfast.outputs import Buffer, Receiver, Refused, Sending
-from holdfast.outputs import sending as module
-from holdfast.outputs.buffer_file import Stored
+from holdfast.outputs import Buffer, OutputSender, Receiver, Refused
+from holdfast.outputs import sender as module
+from holdfast.outputs.buffer_file import BufferFile
 from holdfast.runtime.stop import Stop
 from support import wire
 from support.readings import numbered, numbers, polls, tag
@@ -51,17 +51,17 @@ class Running:
         self.receiver, self.buffer, self.stop = Fake(), Buffer(), Stop()
         if buffer is not None:
             self.buffer = buffer
-        self.open_file: Callable[[], Stored] | None = None
+        self.open_file: Callable[[], BufferFile] | None = None
         if file is not None:
-            self.open_file = lambda: Stored(file, 2**30, lambda *_: tag())
+            self.open_file = lambda: BufferFile(file, 2**30, lambda *_: tag())
         self.renewed: list[Collection[tuple[str, str]] | None] = []
         self.start()
 
     def start(self) -> None:
-        self.sending = Sending(
+        self.sender = OutputSender(
             "out", self.receiver, self.buffer, self.open_file, renew=self.renewed.append
         )
-        self.thread = threading.Thread(target=self.sending.run, args=[self.stop])
+        self.thread = threading.Thread(target=self.sender.run, args=[self.stop])
         self.thread.start()
 
     def end(self) -> None:
@@ -71,7 +71,7 @@ class Running:
 
 
 def refused(output: Running) -> int:
-    counted = output.sending.status()["readings"]
+    counted = output.sender.status()["readings"]
     assert isinstance(counted, dict)
     return int(counted["refused"])
 
@@ -117,7 +117,7 @@ def test_a_receiver_without_readings_has_its_turn_every_second(
             return False
 
     receiver = Idle()
-    Sending("out", receiver, Empty()).run(stop)
+    OutputSender("out", receiver, Empty()).run(stop)
 
     assert receiver.attempts == 3
     assert waits == [1.0] * 3
@@ -128,7 +128,7 @@ def test_everything_is_sent_in_order(output: Running) -> None:
         output.buffer.offer(polls(500, start))
     wire.until(lambda: len(output.receiver.sent) == 5000, "all is sent")
     assert output.receiver.sent == list(range(5000))
-    assert output.sending.status() == {
+    assert output.sender.status() == {
         "place": "here",
         "connected": True,
         "readings": {"sent": 5000, "refused": 0, "dropped": 0},
@@ -143,9 +143,9 @@ def test_outputs_that_failed_together_do_not_try_again_together() -> None:
     """Many of them share a broker."""
     pauses = set()
     for _ in range(20):
-        sending = Sending("out", Fake(), Buffer())
-        sending._failed(OSError("no route to host"))
-        pauses.add(sending._pause)
+        sender = OutputSender("out", Fake(), Buffer())
+        sender._failed(OSError("no route to host"))
+        pauses.add(sender._pause)
     assert len(pauses) > 10
 
 
@@ -158,7 +158,7 @@ def test_nothing_is_lost_in_an_outage(
         output.receiver.error = OSError("no route to host")
         output.buffer.offer(polls(1500))
         wire.until(lambda: output.receiver.attempts >= 3, "it is tried again")
-        status = output.sending.status()
+        status = output.sender.status()
         assert (status["connected"], status["waiting"]) == (False, 1500)
         assert status["last_error"] == "no route to host"
         output.buffer.offer(polls(500, 1500))
@@ -182,10 +182,10 @@ def test_a_receiver_that_connects_without_readings_works_again(
         return True
 
     output.receiver.idle = idle  # type: ignore[method-assign]
-    wire.until(lambda: output.sending.status()["connected"] is False, "it has failed")
+    wire.until(lambda: output.sender.status()["connected"] is False, "it has failed")
     works.set()
-    wire.until(lambda: output.sending.status()["connected"] is True, "it works")
-    assert output.sending.status()["failures"] == 0
+    wire.until(lambda: output.sender.status()["connected"] is True, "it works")
+    assert output.sender.status()["failures"] == 0
     assert count(caplog, "output_back") == 1
 
 
@@ -205,7 +205,7 @@ def test_of_a_step_that_is_refused_in_part_the_rest_counts_as_sent(output: Runni
     output.receiver.error = Refused("of another type", numbered(1))
     output.buffer.offer(polls(3))
     wire.until(lambda: refused(output) == 1, "it is refused")
-    counted = output.sending.status()["readings"]
+    counted = output.sender.status()["readings"]
     assert counted == {"sent": 2, "refused": 1, "dropped": 0}
 
 
@@ -244,9 +244,9 @@ def test_what_is_refused_at_the_end_is_not_kept(tmp_path: Path) -> None:
     output = Running()
     output.end()
     output.buffer.offer(polls(3))
-    output.buffer.stored = Stored(tmp_path / "b.db", 2**30, lambda *_: tag())
+    output.buffer.stored = BufferFile(tmp_path / "b.db", 2**30, lambda *_: tag())
     output.receiver.error = Refused("HTTP 400", numbered(3))
-    output.sending._finish(inf)
+    output.sender._finish(inf)
     assert (refused(output), len(output.buffer)) == (3, 0)
     output.buffer.detach()
 
@@ -256,10 +256,12 @@ def test_an_error_that_ends_an_output_leaves_its_values_in_the_file(tmp_path: Pa
     receiver.error = RuntimeError("a bug")
     buffer.offer(polls(1500))
     file = tmp_path / "b.db"
-    sending = Sending("out", receiver, buffer, lambda: Stored(file, 2**30, lambda *_: tag()))
+    sender = OutputSender(
+        "out", receiver, buffer, lambda: BufferFile(file, 2**30, lambda *_: tag())
+    )
     with pytest.raises(RuntimeError, match="a bug"):
-        sending.run(Stop())
-    stored = Stored(file, 2**30, lambda *_: tag())
+        sender.run(Stop())
+    stored = BufferFile(file, 2**30, lambda *_: tag())
     assert stored.count == 1500
     stored.close()
 
@@ -360,7 +362,7 @@ def test_a_buffer_keeps_what_waits_for_the_next_output() -> None:
     output.receiver.error = OSError("down")
     output.buffer.offer(polls(5))
     wire.until(lambda: output.receiver.attempts > 0, "it is tried")
-    output.sending._is_followed = lambda: True
+    output.sender._is_followed = lambda: True
     output.end()
     output.receiver, output.stop = Fake(), Stop()
     output.start()
@@ -381,7 +383,7 @@ def test_two_outputs_never_share_a_buffer() -> None:
     before.buffer.offer(polls(3))
     try:
         wire.until(lambda: before.receiver.attempts, "it is tried")
-        before.sending._is_followed = lambda: True
+        before.sender._is_followed = lambda: True
         before.stop.set()
         second, third = Running(buffer=before.buffer), Running(buffer=before.buffer)
         second.end()
@@ -399,10 +401,10 @@ def test_a_file_that_can_not_be_opened_stops_nothing(
     output = Running(tmp_path / "missing" / "b.db")
     output.buffer.offer(polls(3))
     wire.until(lambda: output.receiver.sent == [0, 1, 2], "all is sent")
-    assert "unable to open database file" in str(output.sending.status()["file_error"])
+    assert "unable to open database file" in str(output.sender.status()["file_error"])
     (tmp_path / "missing").mkdir()
     output.buffer.offer(polls(1, 3))
-    wire.until(lambda: output.sending.status()["file_error"] is None, "the file is opened")
+    wire.until(lambda: output.sender.status()["file_error"] is None, "the file is opened")
     output.end()
     assert count(caplog, "output_file_failed") == 1
 
@@ -410,7 +412,7 @@ def test_a_file_that_can_not_be_opened_stops_nothing(
 def test_a_file_that_is_opened_late_is_followed_by_the_last_values(tmp_path: Path) -> None:
     """What it has is older than what was sent meanwhile."""
     (tmp_path / "ready").mkdir()
-    stored = Stored(tmp_path / "ready" / "b.db", 2**30, lambda *_: tag())
+    stored = BufferFile(tmp_path / "ready" / "b.db", 2**30, lambda *_: tag())
     stored.add([numbered(3)])
     stored.close()
     output = Running(tmp_path / "missing" / "b.db")
@@ -452,7 +454,7 @@ def test_what_is_lost_with_a_folder_that_was_removed_is_told(
     folder.rename(tmp_path / "moved")
     wire.until(lambda: count(caplog, "output_file_failed") == 1, "it is logged")
     output.buffer.offer(polls(1, 3))
-    output.sending._is_followed = lambda: is_followed
+    output.sender._is_followed = lambda: is_followed
     output.end()
     [record] = [record for record in caplog.records if record.message == "output_unsent"]
     assert vars(record)["fields"]["count"] == lost
@@ -463,7 +465,7 @@ def test_a_file_from_which_nothing_can_be_removed_stops_nothing(
 ) -> None:
     """As on a full disk. Nothing is sent twice."""
     file = tmp_path / "b.db"
-    stored = Stored(file, 2**30, lambda *_: tag())
+    stored = BufferFile(file, 2**30, lambda *_: tag())
     for start in range(0, 5000, 500):
         stored.add([numbered(500, start)])
     stored._db.execute(
@@ -473,7 +475,7 @@ def test_a_file_from_which_nothing_can_be_removed_stops_nothing(
     output = Running(file)
     output.buffer.offer(polls(5, 5000))
     wire.until(lambda: len(output.receiver.sent) >= 5005, "all is sent")
-    wire.until(lambda: output.sending.status()["file_error"] is None, "there is a new file")
+    wire.until(lambda: output.sender.status()["file_error"] is None, "there is a new file")
     output.end()
     assert output.receiver.sent == list(range(5005))
     assert (count(caplog, "output_file_failed"), count(caplog, "output_failed")) == (1, 0)
@@ -487,7 +489,7 @@ def test_a_damaged_file_stops_nothing(
     file = tmp_path / "b.db"
     if not is_aside:
         (tmp_path / "b.db.damaged").mkdir()
-    stored = Stored(file, 2**30, lambda *_: tag())
+    stored = BufferFile(file, 2**30, lambda *_: tag())
     for start in range(0, 5000, 1000):
         stored.add([numbered(1000, start)])
     [pages] = stored._db.execute("PRAGMA page_count").fetchone()
@@ -503,7 +505,7 @@ def test_a_damaged_file_stops_nothing(
     output.end()
     assert len(output.receiver.sent) + output.buffer.dropped == 5005
     assert file.exists()
-    assert (output.sending.status()["file_error"] is None) is is_aside
+    assert (output.sender.status()["file_error"] is None) is is_aside
     assert count(caplog, "output_file_failed") == count(caplog, "output_dropped") == 1
     assert count(caplog, "output_failed") == 0
 

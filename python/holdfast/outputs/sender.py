@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
     from holdfast.outputs.buffer import Buffer
-    from holdfast.outputs.buffer_file import Stored
+    from holdfast.outputs.buffer_file import BufferFile
     from holdfast.polling import Reading
     from holdfast.runtime.stop import Stop
 
@@ -88,7 +88,7 @@ def soon_after(stop: Stop, end: Callable[[], None]) -> None:
 
 
 def log_unsent(name: str, buffer: Buffer) -> None:
-    """Logs what is lost at the end of an output, if no `Sending` runs that does so at its own end.
+    """Logs what is lost at the end of an output, if no `OutputSender` runs that does so itself.
 
     Its receiver may have failed, or never have been made.
     """
@@ -106,7 +106,7 @@ def _log_count(name: str, unsent: int) -> None:
         log_lines.write(logging.WARNING, "output_unsent", output=name, count=unsent)
 
 
-class Sending:
+class OutputSender:
     """An adapter that sends what is in a buffer to a receiver.
 
     At its end, `leaves_file` tells whether no output uses the file any more, and `is_followed`
@@ -119,7 +119,7 @@ class Sending:
         name: str,
         receiver: Receiver,
         buffer: Buffer,
-        open_file: Callable[[], Stored] | None = None,
+        open_file: Callable[[], BufferFile] | None = None,
         leaves_file: Callable[[], bool] = lambda: False,
         is_followed: Callable[[], bool] = lambda: False,
         renew: Callable[[Collection[tuple[str, str]] | None], object] = lambda _: None,
@@ -165,12 +165,12 @@ class Sending:
                 self._use_file()
                 if not self._step(stop):
                     self._wait(stop)
-                self._keep_late()
+                self._move_late_to_file()
                 self._log_dropped()
                 self._replace_lost()
             self._finish(stop.at + STOP_TIMEOUT_S)
         except Exception:
-            self._keep(STORE_TIMEOUT_S)
+            self._move_to_file(STORE_TIMEOUT_S)
             raise
         finally:
             self._receiver.close()
@@ -259,11 +259,11 @@ class Sending:
         """Waits for the next attempt, and moves new readings to the file meanwhile."""
         end = time.monotonic() + self._pause
         while not stop.is_set() and (left := end - time.monotonic()) > 0:
-            self._keep(CHECK_INTERVAL_S)
+            self._move_to_file(CHECK_INTERVAL_S)
             self._log_dropped()
             stop.wait(min(CHECK_INTERVAL_S, left))
 
-    def _keep_late(self) -> None:
+    def _move_late_to_file(self) -> None:
         """Moves readings to the file if they come faster than they are sent, or wait for those in
         the file: a crash would lose them, or memory not have room for them.
         """
@@ -272,7 +272,7 @@ class Sending:
             self._looked_at = now
             is_late |= self._buffer.has_late()
         if is_late:
-            self._keep(CHECK_INTERVAL_S)
+            self._move_to_file(CHECK_INTERVAL_S)
 
     def _finish(self, end: float) -> None:
         """Sends remaining readings until `end`, then moves the rest to the file."""
@@ -283,7 +283,7 @@ class Sending:
                 except OSError:
                     break
                 self._confirm_sent()
-        self._keep(STORE_TIMEOUT_S)
+        self._move_to_file(STORE_TIMEOUT_S)
         self._log_dropped(0.0)
         self._log_unsent()
         if not self._is_followed():
@@ -308,12 +308,12 @@ class Sending:
                 # Newer values than these may have been sent: the last of a tag must be the newest.
                 self._renew(None)
 
-    def _keep(self, seconds: float) -> None:
+    def _move_to_file(self, seconds: float) -> None:
         with self._using_file():
             if self._buffer.restore_file():
                 log_lines.write(logging.WARNING, "output_file_recreated", output=self._name)
                 self._file_error = None
-            if self._buffer.keep(seconds):
+            if self._buffer.move_to_file(seconds):
                 self._file_error = None
 
     def _log_dropped(self, every: float = DROPPED_INTERVAL_S) -> None:
