@@ -247,8 +247,8 @@ class Clocked(Stop):
 def test_pauses_grow_up_to_ten_seconds(reasons: list[int]) -> None:
     reasons.append(errno.EADDRINUSE)
     port, stop = Port("rest", "127.0.0.1", 1), Clocked(7)
-    assert not port.bind()
-    assert not port.wait(stop)
+    assert not port.try_bind()
+    assert not port.bind_when_free(stop)
     assert stop.pauses == [1, 2, 4, 8, 10, 10, 10]
     assert port.failures == 7
 
@@ -266,8 +266,8 @@ def test_any_error_is_logged_once_and_retried(
 ) -> None:
     reasons.append(number)
     port = Port("rest", "::", 80)
-    assert not port.bind()
-    assert not port.wait(Clocked(5))
+    assert not port.try_bind()
+    assert not port.bind_when_free(Clocked(5))
     [entry] = log.of("adapter_not_listening")
     assert entry["bind"] == "[::]:80"
     assert entry["reason"].startswith(reason)
@@ -279,9 +279,9 @@ def test_another_reason_and_a_long_time_are_logged_again(
 ) -> None:
     reasons += [errno.EADDRNOTAVAIL, *[errno.EADDRINUSE] * 3]
     port = Port("rest", "127.0.0.1", 80)
-    assert not port.wait(Clocked(3))
+    assert not port.bind_when_free(Clocked(3))
     monkeypatch.setattr(ports, "LOG_INTERVAL_S", 0)
-    assert not port.bind()
+    assert not port.try_bind()
     assert [(each["reason"], each["attempts"]) for each in log.of("adapter_not_listening")] == [
         ("Cannot assign requested address", 1),
         (BUSY, 2),
@@ -291,7 +291,7 @@ def test_another_reason_and_a_long_time_are_logged_again(
 
 def test_an_address_that_this_machine_does_not_have_is_retried() -> None:
     port = Port("rest", "192.0.2.1", 0)  # An address for documentation.
-    assert not port.bind()
+    assert not port.try_bind()
     assert port.error == "Cannot assign requested address"
 
 
@@ -299,17 +299,17 @@ def test_a_port_that_was_never_bound_has_no_socket() -> None:
     port = Port("rest", "127.0.0.1", 0)
     with pytest.raises(RuntimeError, match=r"rest: 127\.0\.0\.1:0 is not bound"):
         _ = port.listener
-    assert port.bind()
+    assert port.try_bind()
     stop = Stop()
     stop.set()
-    assert not port.wait(stop)
+    assert not port.bind_when_free(stop)
     port.close()
 
 
 def test_a_closed_port_still_has_a_status() -> None:
     """Programs may ask the diagnostics while the appliance stops, and after that."""
     port = Port("rest", "127.0.0.1", 0)
-    assert port.bind()
+    assert port.try_bind()
     bound = port.status()
     assert (bound["listening"], bound["address"]) == (True, f"127.0.0.1:{port.address[1]}")
     port.close()
@@ -319,11 +319,11 @@ def test_a_closed_port_still_has_a_status() -> None:
 @pytest.mark.usefixtures("quick")
 def test_a_wait_in_another_thread_ends_when_the_port_is_free(taken: Taken) -> None:
     port = Port("rest", *taken.addresses["rest"])
-    assert not port.bind()
+    assert not port.try_bind()
     stop, bound = Stop(), threading.Event()
 
     def wait() -> None:
-        if port.wait(stop):
+        if port.bind_when_free(stop):
             bound.set()
 
     thread = threading.Thread(target=wait)
@@ -342,7 +342,7 @@ def test_a_port_is_logged_once_whoever_finds_it_bound(log: web.Records) -> None:
     port = Port("rest", "127.0.0.1", 0)
     port.log_listening()
     assert log.of("listening") == []
-    assert port.bind()
+    assert port.try_bind()
     for _ in range(2):
         port.log_listening()
     assert [each["address"] for each in log.of("listening")] == [joined(*port.address)]

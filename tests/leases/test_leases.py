@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NatsTimeout
 
-from holdfast.net.nats.connection import Broker, Ping, Servers
+from holdfast.net.nats.connection import NatsConnection, Ping, Servers
 from holdfast.net.nats.key_bucket import Outdated
 from holdfast.replication.leases.bucket import SETTLED, LeaseBucket
 from holdfast.replication.leases.leases import Leases
@@ -74,7 +74,7 @@ class Node:
 async def running(url: str, name: str, times: LeaseTimes) -> AsyncIterator[Node]:
     """A node that disappears at the end of the block, without giving anything back."""
     node = Node(name, times)
-    broker = Broker(Servers((url,)), {}, node.connected, Ping())
+    broker = NatsConnection(Servers((url,)), {}, node.connected, Ping(), name="test")
     tasks = [asyncio.create_task(broker.run()), asyncio.create_task(node.leases.run())]
     try:
         yield node

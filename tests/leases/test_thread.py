@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from holdfast.net.nats.connection import Broker, Ping, Servers
+from holdfast.net.nats.connection import NatsConnection, Ping, Servers
 from holdfast.replication.leases.bucket import LeaseBucket
 from holdfast.replication.leases.leases import Leases
 from holdfast.replication.leases.thread import LeaseThread, Relay
@@ -59,7 +59,7 @@ class Node:
         wire.until(lambda: self.asked >= asked + 5, "the leases are looked at")
 
     async def _connect(self, connected: Callable[[Client | None], None]) -> None:
-        await Broker(self._servers, {}, connected, Ping()).run()
+        await NatsConnection(self._servers, {}, connected, Ping(), name="test").run()
 
     def taken(self, key: str) -> None:
         self.events.append(f"taken {key}")

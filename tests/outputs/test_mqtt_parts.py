@@ -12,7 +12,7 @@ from holdfast.config.values.mqtt_output_topics import TopicNames
 from holdfast.net.mqtt.broker_socket import BrokerSocket
 from holdfast.net.mqtt.packet_splitter import PacketSplitter
 from holdfast.net.mqtt.packets import parse_publish
-from holdfast.net.mqtt.selector import Waiter
+from holdfast.net.mqtt.waiter import Waiter
 from holdfast.outputs.mqtt.delivery import Delivery, Message, packed, packed_topic
 from holdfast.runtime.stop import Stop
 from support.config_folder import Folder

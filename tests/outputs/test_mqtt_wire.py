@@ -115,7 +115,7 @@ def test_a_default_client_id_is_not_made_too_long(
 
 
 @pytest.mark.parametrize("output", [{}, SETTINGS], ids=["mqtt", "sparkplug"])
-def test_connections_that_are_cut_soon_have_a_likely_cause(
+def test_connections_that_are_early_cuts_have_a_likely_cause(
     plant: Plant, fake: FakeBroker, output: dict[str, Any]
 ) -> None:
     plant.device()
@@ -136,10 +136,10 @@ def test_connections_that_are_cut_soon_have_a_likely_cause(
     )
 
 
-def test_connections_that_have_lasted_are_not_cut_soon(
+def test_connections_that_have_lasted_are_not_early_cuts(
     plant: Plant, fake: FakeBroker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(client, "SOON_S", 0.0)
+    monkeypatch.setattr(client, "EARLY_CUT_S", 0.0)
     plant.device()
     plant.run(url=fake.url, version=fake.version)
     for _ in range(4):

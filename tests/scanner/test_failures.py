@@ -16,7 +16,7 @@ import pytest
 import holdfast
 from holdfast.events import log_lines
 from holdfast.events.throttle import Throttle
-from holdfast.net.nats.connection import MAX_PAUSE
+from holdfast.net.nats.connection import MAX_PAUSE_S
 from holdfast.scanner.jetstream.availability import State
 from holdfast.scanner.subscriptions import device as devices
 from support import wire
@@ -207,7 +207,7 @@ def test_what_nats_took_before_it_died_is_published_anew(
 
 
 def test_nats_that_was_away_for_long_is_tried_every_other_second(run_scanner: Run) -> None:
-    broker = broker_of(run_scanner(max_pause_s=MAX_PAUSE).scanner)
+    broker = broker_of(run_scanner(max_pause_s=MAX_PAUSE_S).scanner)
     client = broker.client
     assert client is not None
     broker._note_lost("tested")
@@ -215,8 +215,8 @@ def test_nats_that_was_away_for_long_is_tried_every_other_second(run_scanner: Ru
     for _ in range(50):
         broker._note(client, OSError("no route"))
         pauses.add(client.options["reconnect_time_wait"])
-    assert max(pauses) <= MAX_PAUSE
-    assert len({pause for pause in pauses if pause >= 0.75 * MAX_PAUSE}) > 40, "with jitter"
+    assert max(pauses) <= MAX_PAUSE_S
+    assert len({pause for pause in pauses if pause >= 0.75 * MAX_PAUSE_S}) > 40, "with jitter"
     broker._note_connected(client)
 
 

@@ -15,7 +15,7 @@ from nats.aio.msg import Msg
 from holdfast.client.url import NetworkTarget
 from holdfast.net.nats import batch
 from holdfast.net.nats import outbox as outboxes
-from holdfast.net.nats.connection import Broker, Ping, Servers
+from holdfast.net.nats.connection import NatsConnection, Ping, Servers
 from holdfast.net.nats.outbox import Outbox
 from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.scanner import responder
@@ -413,7 +413,7 @@ def test_an_error_of_the_server_is_logged_once_and_as_it_is_spelled(
 
     async def receive() -> None:
         client = SafeClient()
-        broker = Broker(Servers(), {}, lambda _: None, Ping())
+        broker = NatsConnection(Servers(), {}, lambda _: None, Ping(), name="test")
         broker.client = client
 
         async def failed(error: Exception) -> None:

@@ -10,7 +10,7 @@ from holdfast.scanner.jetstream.restore import StoredSubscriptions
 if TYPE_CHECKING:
     from nats.aio.client import Client
 
-    from holdfast.net.nats.connection import Broker
+    from holdfast.net.nats.connection import NatsConnection
     from holdfast.scanner.fleet.member import FleetMember
     from holdfast.scanner.jetstream.store import EntryStore
     from holdfast.scanner.polling.allowed_devices import AllowedDevices
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.ttl import SubscriptionTtls
 
 
-def broker_of(scanner: Scanner) -> Broker:
+def broker_of(scanner: Scanner) -> NatsConnection:
     """Returns its connection to NATS."""
     return scanner._broker
 

@@ -13,7 +13,7 @@ import pytest
 from nats.errors import Error
 
 from holdfast.net.mqtt.dial import dial
-from holdfast.net.mqtt.selector import Waiter
+from holdfast.net.mqtt.waiter import Waiter
 from holdfast.net.nats.connection import Servers
 from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.net.secure_channel import TlsRefused

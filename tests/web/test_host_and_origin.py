@@ -143,8 +143,8 @@ def test_browsers_mark_all_requests_of_other_pages_to_this_machine_and_over_http
 ) -> None:
     request = Request("GET", "/", b"", [(b"host", host.encode())], "127.0.0.1:50000")
     for is_https, expected in ((False, over_http), (True, over_https)):
-        origins = Origins(names={NAME}, allowed="", is_https=is_https)
-        assert origins.are_all_marked(request) is expected
+        origins = Origins(names={NAME}, name_refusal="", is_https=is_https)
+        assert origins.browsers_mark_foreign_requests(request) is expected
 
 
 @pytest.mark.parametrize("kind", ["rest", "gateway"])

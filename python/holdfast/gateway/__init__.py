@@ -68,7 +68,7 @@ class Gateway:
                 when_full="evict",
             ),
             request_timeout=settings.limits.request_timeout,
-            leaving=True,
+            half_close_is_disconnect=True,
             rejection=gateway_rejection,
             https=https,
         )

@@ -89,11 +89,12 @@ class App(Application):
         is_https: bool = False,
     ) -> None:
         limits = self._limits = settings.limits
-        allowed = f" without tokens: an IP address, localhost, or a name in {HOSTS}"
+        what = f"an IP address, localhost, or a name in {HOSTS}"
+        name_refusal = f"Host is a name, allowed without tokens: {what}"
         names = None if settings.tokens else settings.hosts
         super().__init__(
             [each for each in operations if health is not None or each.path not in probes.PATHS],
-            Origins(names=names, allowed=allowed, is_https=is_https),
+            Origins(names=names, name_refusal=name_refusal, is_https=is_https),
             tokens=settings.tokens,
             max_body=limits.body,
         )
@@ -358,7 +359,7 @@ class App(Application):
 
     async def watch(self, request: Request, given: Given) -> None:
         """Watches a range of a device."""
-        if not self._settings.tokens and not self.origins.are_all_marked(request):
+        if not self._settings.tokens and not self.origins.browsers_mark_foreign_requests(request):
             # The only GET that asks a device.
             allowed = "localhost, 127.0.0.1, [::1], or an address over HTTPS"
             detail = f"Host is not allowed without tokens for GET {watch.PATH}, allowed: {allowed}"

@@ -36,7 +36,7 @@ VERSION = 1
 SNAPSHOT_KEY = "snapshot"
 """The key that names the snapshots."""
 
-UNUSABLE = (
+NO_USABLE_BACKUP = (
     "no node could begin with the backup; try again when a node that runs has stored a new snapshot"
 )
 
@@ -213,12 +213,14 @@ async def _newest_snapshot(client: SafeClient, log: str) -> _Snapshot:
     keys, _, steps = streams(log)
     at, key = await _last(client, keys, f"$KV.{steps}.{SNAPSHOT_KEY}")
     if not key:
-        raise BackupFailed(f"{keys} has no key {SNAPSHOT_KEY}: {UNUSABLE}")
+        raise BackupFailed(f"{keys} has no key {SNAPSHOT_KEY}: {NO_USABLE_BACKUP}")
     try:
         newest = json.loads(key)["newest"]
         return _Snapshot(at, int(newest["sequence"]), str(newest["object"]))
     except (ValueError, KeyError, TypeError) as error:
-        reason = f"{keys}: the key {SNAPSHOT_KEY} is {key[:100]!r}, not a snapshot: {UNUSABLE}"
+        reason = (
+            f"{keys}: the key {SNAPSHOT_KEY} is {key[:100]!r}, not a snapshot: {NO_USABLE_BACKUP}"
+        )
         raise BackupFailed(reason) from error
 
 
@@ -251,7 +253,7 @@ async def _fetch_all(client: SafeClient, log: str, folder: Path) -> dict[str, di
     if missing is not None:
         if await _newest_snapshot(client, log) != newest:
             raise _Replaced(REPLACED)
-        raise BackupFailed(f"{missing}: {UNUSABLE}")
+        raise BackupFailed(f"{missing}: {NO_USABLE_BACKUP}")
     return contents
 
 
@@ -373,7 +375,7 @@ async def _restore(
     contents: dict[str, Any],
     confirmed: dict[str, bool],
 ) -> int:
-    """Adds to `confirmed` the streams that the servers restore, and whether they have done so."""
+    """Notes in `confirmed` which streams the servers restore, and if they have confirmed it."""
     for name in reversed(streams(log)):
         config = contents[name]["config"] | {"num_replicas": replicas}
         request = {"config": config, "state": contents[name]["state"]}

@@ -10,7 +10,7 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from holdfast.events import log_lines
-from holdfast.net.nats.connection import Broker
+from holdfast.net.nats.connection import NatsConnection
 from holdfast.runtime import tasks
 from holdfast.scanner.commands import Commands
 from holdfast.scanner.dialects import DIALECTS, Dialect
@@ -128,11 +128,12 @@ class Scanner:
             self._placement,
             self._responder,
         )
-        self._broker = Broker(
+        self._broker = NatsConnection(
             settings.servers,
             self._handlers(dialect),
             self._connected,
             settings.ping,
+            name="holdfast scan",
             shared=self._placement.shared_subjects,
             queue=self._placement.queue_group,
             until_member=self._ready.wait if self._placement.shared_subjects else None,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from holdfast.config.values.scanner_settings import PARTITIONS, written_pollable
-from holdfast.net.nats.connection import MAX_PAUSE, Ping, Servers
+from holdfast.net.nats.connection import MAX_PAUSE_S, Ping, Servers
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.runtime.standstill import STANDSTILL_S
@@ -62,7 +62,7 @@ class Settings:
     """Whether requests are refused that would otherwise be adjusted."""
     ping: Ping = field(default_factory=Ping)
     """How a NATS server that does not answer is detected."""
-    max_pause_s: float = MAX_PAUSE
+    max_pause_s: float = MAX_PAUSE_S
     """Between attempts to connect to NATS."""
     publish_logs: bool = True
     """Whether the log is also published."""

@@ -62,9 +62,10 @@ class Metrics:
             registry.register(Figures(partial(tag_metrics, diagnostics)))
         ProcessCollector(registry=registry)
         GCCollector(registry=registry)
-        allowed = ": an IP address, localhost, or a name in metrics.hosts"
+        what = "an IP address, localhost, or a name in metrics.hosts"
+        name_refusal = f"Host is a name, allowed: {what}"
         names = frozenset(settings.hosts)
-        origins = Origins(names=names, allowed=allowed, is_https=https is not None)
+        origins = Origins(names=names, name_refusal=name_refusal, is_https=https is not None)
         self._app = App(registry, health, origins)
         self._server = WebServer(
             "metrics",

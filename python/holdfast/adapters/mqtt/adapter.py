@@ -18,7 +18,7 @@ from holdfast.events import log_lines
 from holdfast.net.addresses import joined
 from holdfast.net.mqtt.client import ClientId
 from holdfast.net.mqtt.dial import CONNACK_TIMEOUT_S
-from holdfast.net.mqtt.selector import Ended, Waiter
+from holdfast.net.mqtt.waiter import Ended, Waiter
 from holdfast.net.secure_channel import failure_text
 from holdfast.runtime.backoff import Backoff
 from holdfast.runtime.text import quote
@@ -162,7 +162,7 @@ class Mqtt:
             if readable or pending:
                 link.read_more()
             link.loop_misc()
-        self._ending = link.trouble or self._ending
+        self._ending = link.end_reason or self._ending
 
     def _ended(self, link: BrokerConnection | None) -> float:
         """Logs the end of a connection or attempt. Returns the seconds that it was connected."""

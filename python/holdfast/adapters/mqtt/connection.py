@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from holdfast.adapters.mqtt.inbox import Inbox
     from holdfast.config.models.services import MqttConfig
     from holdfast.net.mqtt.packets import Publish
-    from holdfast.net.mqtt.selector import Waiter
+    from holdfast.net.mqtt.waiter import Waiter
 
 MAX_UNSENT_PACKETS = 1000
 """Limit of unsent packets, mostly acknowledgements. Above it nothing is read from the broker."""
@@ -89,7 +89,7 @@ class BrokerConnection(BrokerClient):
     @property
     def pending(self) -> bool:
         """Whether `read_more` has something to do though nothing arrives."""
-        return self.connection.failure is not None or (self.may_read and self._is_late)
+        return self.connection.error is not None or (self.may_read and self._is_late)
 
     def accepted(self, properties: Properties | None) -> None:
         """Applies the limits from the broker's CONNACK."""
@@ -156,7 +156,7 @@ class BrokerConnection(BrokerClient):
             if not self.is_open or not self.may_read:
                 return
         self._is_late = False
-        if self.connection.failure is not None:
+        if self.connection.error is not None:
             self.notice()
 
     def _note_alive(self) -> None:
@@ -194,7 +194,7 @@ class BrokerConnection(BrokerClient):
         elif message.qos == 2:
             self._unreleased.add(message.identifier)
             self.connection.send_to_broker(acknowledgement(_PUBREC, message.identifier))
-        if not is_known and self.connection.failure is None:
+        if not is_known and self.connection.error is None:
             self._answer(self, message, result)
 
     def _release(self, body: bytes | bytearray) -> None:

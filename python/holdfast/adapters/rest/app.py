@@ -71,11 +71,12 @@ class App(Application):
         is_https: bool = False,
     ) -> None:
         self.grants = Grants(settings, memory_access.memories)
-        allowed = " without tokens: an IP address, localhost, or a name in rest.hosts"
+        what = "an IP address, localhost, or a name in rest.hosts"
+        name_refusal = f"Host is a name, allowed without tokens: {what}"
         names = None if self.grants.secrets else frozenset(settings.hosts)
         super().__init__(
             operations,
-            Origins(names=names, allowed=allowed, is_https=is_https),
+            Origins(names=names, name_refusal=name_refusal, is_https=is_https),
             tokens=self.grants.secrets,
             anyone=ANYONE,
             max_body=settings.max_body,

@@ -265,6 +265,6 @@ class _LogLeases:
         return None if obstacle is None else f"the log is not usable here: {obstacle}"
 
     async def _connect(self, connected: Callable[[Any], None]) -> None:
-        from holdfast.net.nats.connection import Broker, Ping
+        from holdfast.net.nats.connection import NatsConnection, Ping
 
-        await Broker(self._servers, {}, connected, Ping(), name="holdfast leases").run()
+        await NatsConnection(self._servers, {}, connected, Ping(), name="holdfast leases").run()

@@ -116,9 +116,9 @@ class Services(Part):
         """Binds the ports, or tries it once: adapters retry it."""
         for endpoint in self.endpoints.values():
             if plan.retries_ports:
-                endpoint.port.bind()
+                endpoint.port.try_bind()
             else:
-                endpoint.port.open()
+                endpoint.port.bind()
 
     def start(self) -> None:
         """Starts the adapters."""
@@ -135,7 +135,7 @@ class Services(Part):
                 endpoints[name] = known
             else:
                 plan.undo.callback(endpoint.port.close)
-                endpoint.port.open()
+                endpoint.port.bind()
 
         def adopt() -> None:
             for known, endpoint in adopted:

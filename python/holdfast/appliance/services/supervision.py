@@ -165,7 +165,7 @@ class Supervisor:
         if self._port is not None:
             if self._port.error is not None:
                 self._state = "failed"
-            self._port.wait(self._stop)
+            self._port.bind_when_free(self._stop)
         while not self._stop.is_set():
             began = time.monotonic()
             ended = self._once()

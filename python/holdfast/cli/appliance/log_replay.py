@@ -34,7 +34,7 @@ from holdfast.cli.signals import SIGNAL_INTERVAL_S, Signals
 from holdfast.cli.terminal_text import print_json
 from holdfast.events import log_lines
 from holdfast.net.addresses import joined
-from holdfast.net.nats.connection import ANSWERING
+from holdfast.net.nats.connection import FIRST_ANSWER_TIMEOUT_S
 from holdfast.net.nats_server import ServerUnusable
 from holdfast.runtime.text import listing
 from holdfast.server import Server
@@ -121,7 +121,7 @@ def replay(
                 sequence=sequence,
                 time_ns=time_ns,
                 follow=follow,
-                connect_timeout=ANSWERING / len(settings.servers),
+                connect_timeout=FIRST_ANSWER_TIMEOUT_S / len(settings.servers),
                 **credentials(settings),
             )
             replaying = opened()

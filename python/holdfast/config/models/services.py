@@ -67,7 +67,7 @@ from holdfast.config.values.scanner_settings import (
 )
 from holdfast.config.values.urls import Broker, parse_broker
 from holdfast.net.addresses import LOOPBACK
-from holdfast.net.nats.pings import PING_INTERVAL_S, PINGS_OUTSTANDING
+from holdfast.net.nats.ping_defaults import PING_INTERVAL_S, PINGS_OUTSTANDING
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.types import Access
 

@@ -131,20 +131,20 @@ class Authority:
         return self.chain[0]
 
     def issue_server(
-        self, name: str, names: Sequence[x509.GeneralName], public: PrivateKey, days: int
+        self, name: str, names: Sequence[x509.GeneralName], subject_key: PrivateKey, days: int
     ) -> x509.Certificate:
         """Issues the certificate of a server with these alternative names. Raises `Refused`."""
         if not names:
             raise Refused("a server needs at least one DNS name or IP address")
-        builder = self._leaf(name, public, days, ExtendedKeyUsageOID.SERVER_AUTH)
+        builder = self._leaf(name, subject_key, days, ExtendedKeyUsageOID.SERVER_AUTH)
         builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
         return builder.sign(self.key, _hash(self.key))
 
     def issue_client(
-        self, name: str, role: str | None, public: PrivateKey, days: int
+        self, name: str, role: str | None, subject_key: PrivateKey, days: int
     ) -> x509.Certificate:
         """Issues the certificate of a client, with or without a role. Raises `Refused`."""
-        builder = self._leaf(name, public, days, ExtendedKeyUsageOID.CLIENT_AUTH)
+        builder = self._leaf(name, subject_key, days, ExtendedKeyUsageOID.CLIENT_AUTH)
         if role is not None:
             extension = x509.UnrecognizedExtension(ROLE, role_der(role))
             builder = builder.add_extension(extension, critical=False)
@@ -183,15 +183,15 @@ class Authority:
         )
 
     def _leaf(
-        self, name: str, public: PrivateKey, days: int, purpose: x509.ObjectIdentifier
+        self, name: str, subject_key: PrivateKey, days: int, purpose: x509.ObjectIdentifier
     ) -> x509.CertificateBuilder:
         ends, last = now() + timedelta(days=days), self.certificate.not_valid_after_utc
         if last <= now():
             raise Refused(f"the authority expired on {last:%Y-%m-%d}: create a new one")
-        builder = _builder(_subject(name), self.certificate.subject, public, min(ends, last))
+        builder = _builder(_subject(name), self.certificate.subject, subject_key, min(ends, last))
         return (
             builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-            .add_extension(_leaf_usage(public), critical=True)
+            .add_extension(_leaf_usage(subject_key), critical=True)
             .add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
             .add_extension(_issuer_id(self.certificate), critical=False)
         )
@@ -271,25 +271,25 @@ def _subject(name: str) -> x509.Name:
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, public: PrivateKey, ends: datetime
+    subject: x509.Name, issuer: x509.Name, subject_key: PrivateKey, ends: datetime
 ) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
         .issuer_name(issuer)
-        .public_key(public.public_key())
+        .public_key(subject_key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now() - CLOCK_SKEW)
         .not_valid_after(ends)
         .add_extension(
-            x509.SubjectKeyIdentifier.from_public_key(public.public_key()), critical=False
+            x509.SubjectKeyIdentifier.from_public_key(subject_key.public_key()), critical=False
         )
     )
 
 
-def _leaf_usage(public: PrivateKey) -> x509.KeyUsage:
+def _leaf_usage(subject_key: PrivateKey) -> x509.KeyUsage:
     # Cipher suites of old devices encrypt with an RSA key. Holdfast has none of them.
-    if isinstance(public, rsa.RSAPrivateKey):
+    if isinstance(subject_key, rsa.RSAPrivateKey):
         return _usage("digital_signature", "key_encipherment")
     return _usage("digital_signature")
 

@@ -29,14 +29,14 @@ class Origins:
     """The rule of one application."""
 
     def __init__(
-        self, *, names: Container[str] | None, allowed: str, is_https: bool = False
+        self, *, names: Container[str] | None, name_refusal: str, is_https: bool = False
     ) -> None:
         """`names`: those that Host may have besides addresses, in lower case; `None`: any.
 
-        `allowed` says in errors which Hosts are allowed.
+        `name_refusal` is the error for another name, which says what is allowed.
         """
         self._names = names
-        self._allowed = allowed
+        self._name_refusal = name_refusal
         self._schemes = (b"https",) if is_https else (b"http", b"https")
         """Over HTTP, an Origin may have HTTPS: a proxy in front of this server may speak it."""
 
@@ -55,7 +55,7 @@ class Origins:
             return
         name = _name_in(host)
         if name not in self._names and name != "localhost" and _address_in(name) is None:
-            raise BadRequest("foreign_page", f"Host is a name, allowed{self._allowed}")
+            raise BadRequest("foreign_page", self._name_refusal)
 
     def admits(self, request: Request) -> bool:
         """Whether `check` finds nothing."""
@@ -65,13 +65,15 @@ class Origins:
             return False
         return True
 
-    def are_all_marked(self, request: Request) -> bool:
+    def browsers_mark_foreign_requests(self, request: Request) -> bool:
         """Whether browsers mark every request of another site's page to this Host.
 
-        Over HTTP, they send Sec-Fetch-Site to this machine only (Fetch Metadata: to URLs that are
-        potentially trustworthy). To the address of a network, as to a name, a GET may have neither
-        that nor Origin. Nor to an unspecified address, such as
-        `0.0.0.0`, or an IPv4-mapped one: these reach this machine, but browsers do not know it.
+        They send Sec-Fetch-Site to URLs that are potentially trustworthy (Fetch Metadata). To
+        others, a GET may have neither that nor Origin.
+
+        - All are marked to `localhost`, to loopback addresses, and over HTTPS to any address.
+        - They may not be to other names, and over HTTP to other addresses, also to those that reach
+          this machine unknown to browsers: unspecified ones, as `0.0.0.0`, and IPv4-mapped ones.
         """
         host = request.header(b"host")
         if host is None:

@@ -47,7 +47,7 @@ def explained(error: OSError, port: int) -> str:
 
 
 class Port:
-    """The port of one service. Bound by `bind` or `wait`, and then until `close`."""
+    """The port of one service. Bound by one of the `bind` methods, and then until `close`."""
 
     def __init__(self, name: str, host: str, port: int) -> None:
         self.name = name
@@ -103,39 +103,39 @@ class Port:
             **failure,
         }
 
-    def open(self) -> None:
+    def bind(self) -> None:
         """Binds the port. Raises `OSError`, with the name of the service."""
         try:
-            self._open()
+            self._listen()
         except OSError as error:
             at = self.bind_address
             raise OSError(
                 f"{self.name}: can't listen on {at}: {explained(error, self._port)}"
             ) from error
 
-    def bind(self) -> bool:
+    def try_bind(self) -> bool:
         """Tries once to bind the port. A failure is logged. Returns whether the port is bound."""
         try:
-            self._open()
+            self._listen()
         except OSError as error:
             self._note(explained(error, self._port))
             return False
         return True
 
-    def _open(self) -> None:
+    def _listen(self) -> None:
         if self._listener is None:
             listener = listen(self._host, self._port)
             host, port = listener.getsockname()[:2]
             self._listener, self._bound = listener, (host, port)
             self.error = None
 
-    def wait(self, stop: Stop) -> bool:
+    def bind_when_free(self, stop: Stop) -> bool:
         """Tries to bind the port until it succeeds. Returns `False` if `stop` was set."""
         while not stop.is_set():
             late = self.error is not None
             if late and stop.wait(self._pause):
                 break
-            if self.bind():
+            if self.try_bind():
                 if late:
                     self.log_listening()
                 return True

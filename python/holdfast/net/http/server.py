@@ -95,8 +95,9 @@ class WebServer:
     With `https`, connections use TLS. `request_timeout` includes the handshake; connections in it
     have as many places of their own as `limits` gives to all.
 
-    A peer that half-closes the connection still gets its responses. With `leaving`, a half-close
-    means that the client is gone, because a full close looks the same to the server.
+    A peer that half-closes the connection still gets its responses. With
+    `half_close_is_disconnect`, it means that the client is gone, because a full close looks the
+    same to the server.
     """
 
     name: str
@@ -107,7 +108,7 @@ class WebServer:
     limits: ConnectionLimits
     request_timeout: float
     stop_timeout: float = STOP_TIMEOUT_S
-    leaving: bool = False
+    half_close_is_disconnect: bool = False
     rejection: Rejection = rejection
     https: Https | None = None
 
@@ -186,7 +187,7 @@ class WebServer:
             grace=EVICTION_GRACE_S,
             request_timeout=self.request_timeout,
             idle_timeout=KEEP_ALIVE_S,
-            leaving=self.leaving,
+            leaving=self.half_close_is_disconnect,
             tls=None if https is None else https.core,
             refusals=[(name, each.headers, each.body) for name, each in refused.items()],
         )
@@ -287,7 +288,8 @@ class WebServer:
         finally:
             del self._open[request.exchange.number]
         if request.has_begun:
-            request.exchange.end(answer is None)
+            # A stream can't become an error response any more: it is cut off.
+            request.exchange.end(is_complete=answer is None)
         elif answer is not None:
             self._respond(request, answer)
             if not self._is_flush_due:
@@ -456,7 +458,7 @@ class _ServerRequest(Request):
 
     async def end(self) -> None:
         """Ends a stream."""
-        self.exchange.end(True)
+        self.exchange.end(is_complete=True)
 
     async def _next(self) -> tuple[str, Any]:
         """Waits for the next event. Raises `ClientDisconnected` if the client is gone already."""

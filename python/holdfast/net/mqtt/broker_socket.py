@@ -22,7 +22,7 @@ class BrokerSocket:
         self.connection = connection
         self._channel = channel
         self.paho_buffer = bytearray()
-        self.failure: Exception | None = None
+        self.error: Exception | None = None
         """Why the connection has ended: an `OSError`, or an `EOFError` if the broker closed it."""
         self.is_open = True
         self._unsent: deque[bytes | memoryview] = deque()
@@ -33,7 +33,7 @@ class BrokerSocket:
         return len(self._unsent)
 
     def receive_from_broker(self, size: int) -> bytes:
-        """Returns the bytes that have arrived: none also if the connection has ended, `failure`."""
+        """Returns the bytes that have arrived: none also if the connection has ended, `error`."""
         try:
             data = self.connection.recv(size)
             if not data:
@@ -43,14 +43,14 @@ class BrokerSocket:
         except BlockingIOError:
             return b""
         except OSError as error:
-            self.failure = error
+            self.error = error
             return b""
         return data
 
     def _end(self) -> None:
         if self._channel is not None:
             self._channel.check_lost()
-        self.failure = EOFError("the broker closed the connection")
+        self.error = EOFError("the broker closed the connection")
 
     def _decrypted(self, channel: SecureChannel, data: bytes) -> bytes:
         try:
@@ -86,7 +86,7 @@ class BrokerSocket:
         except BlockingIOError:
             return
         except OSError as error:
-            self.failure = error
+            self.error = error
 
     # What paho calls.
 
@@ -96,22 +96,22 @@ class BrokerSocket:
             data = bytes(self.paho_buffer[:buffer_size])
             del self.paho_buffer[:buffer_size]
             return data
-        if isinstance(self.failure, OSError):
-            raise self.failure
-        if self.failure is None:
+        if isinstance(self.error, OSError):
+            raise self.error
+        if self.error is None:
             raise BlockingIOError
         return b""
 
     def send(self, buffer: bytes | bytearray) -> int:
         """Takes a packet."""
         self.send_to_broker(bytes(buffer))
-        if isinstance(self.failure, OSError):
-            raise self.failure
+        if isinstance(self.error, OSError):
+            raise self.error
         return len(buffer)
 
     def close(self) -> None:
         """Closes the connection."""
-        if self.is_open and self._channel is not None and self.failure is None:
+        if self.is_open and self._channel is not None and self.error is None:
             self._send(self._channel.end())
         self.is_open = False
         self.connection.close()

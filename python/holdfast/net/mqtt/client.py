@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from paho.mqtt.reasoncodes import ReasonCode
 
     from holdfast.net.mqtt.broker_socket import BrokerSocket
-    from holdfast.net.mqtt.selector import Waiter
+    from holdfast.net.mqtt.waiter import Waiter
     from holdfast.net.tls import Tls
 
 
-SOON_S = 30.0
-"""Seconds after which a connection has lasted. Clients wait less before they connect again."""
+EARLY_CUT_S = 30.0
+"""A connection that lasts less was cut early. Clients wait less before they connect again."""
 
-MAX_CUT_SOON = 2
-"""Connections in a row that a broker or a network may cut soon, as when it is restarted."""
+MAX_EARLY_CUTS = 2
+"""Early cuts in a row that a broker or a network may make, as when it is restarted."""
 
 
 class BrokerSettings(Protocol):
@@ -98,7 +98,7 @@ class BrokerClient(Client):
         )
         self._waiter = waiter
         self._connection: BrokerSocket | None = None
-        self.trouble: str | None = None
+        self.end_reason: str | None = None
         """Why the connection ends, or the last error that paho logged."""
         self.is_accepted = False
         """Whether the broker has accepted the connection."""
@@ -135,11 +135,11 @@ class BrokerClient(Client):
         return self._connection is not None and self._connection.is_open
 
     @property
-    def was_cut_soon(self) -> bool:
+    def was_cut_early(self) -> bool:
         """Whether the connection has been cut without a reason, soon after it was accepted."""
-        if not self.is_accepted or self._connection is None or self._connection.failure is None:
+        if not self.is_accepted or self._connection is None or self._connection.error is None:
             return False
-        return time.monotonic() < self._accepted_at + SOON_S
+        return time.monotonic() < self._accepted_at + EARLY_CUT_S
 
     def accepted(self, properties: Properties | None) -> None:
         """Applies the limits from the broker's CONNACK."""
@@ -159,7 +159,7 @@ class BrokerClient(Client):
 
     def end(self, reason: str) -> None:
         """Closes the connection without DISCONNECT, and notes why."""
-        self.trouble = reason
+        self.end_reason = reason
         self.close()
 
     def close(self) -> None:
@@ -180,7 +180,7 @@ class BrokerClient(Client):
             self.end("the broker sent a second CONNACK")
             return
         if reason.is_failure:
-            self.trouble = f"the broker refused the connection: {reason}"
+            self.end_reason = f"the broker refused the connection: {reason}"
             return
         self.on_log = None
         self.accepted(properties)
@@ -190,7 +190,7 @@ class BrokerClient(Client):
 
     def _note(self, _client: Client, _data: object, level: int, text: str) -> None:
         if level == LogLevel.MQTT_LOG_ERR or "malformed" in text:
-            self.trouble = text
+            self.end_reason = text
 
     def _create_socket(self) -> BrokerSocket:
         settings = self._settings
@@ -206,12 +206,12 @@ class ClientId:
 
     def __init__(self, text: str) -> None:
         self.text = text
-        self._cut_soon = 0
+        self._early_cuts = 0
 
     def explained(self, reason: str, connection: BrokerClient) -> str:
         """Why an accepted connection is over. Called once for each, at its end."""
-        self._cut_soon = self._cut_soon + 1 if connection.was_cut_soon else 0
-        if self._cut_soon <= MAX_CUT_SOON:
+        self._early_cuts = self._early_cuts + 1 if connection.was_cut_early else 0
+        if self._early_cuts <= MAX_EARLY_CUTS:
             return reason
         return f"{reason}; perhaps another client has client_id {self.text}"
 

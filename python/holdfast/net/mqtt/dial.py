@@ -14,7 +14,7 @@ from holdfast.net.secure_channel import SecureChannel
 from holdfast.runtime.text import error_text
 
 if TYPE_CHECKING:
-    from holdfast.net.mqtt.selector import Waiter
+    from holdfast.net.mqtt.waiter import Waiter
     from holdfast.net.resolver import SocketAddress
     from holdfast.net.tls import Tls
 
@@ -83,8 +83,8 @@ def _agree(broker: BrokerSocket, channel: SecureChannel, waiter: Waiter, deadlin
         broker.flush()
         if broker.receive_from_broker(READ_BYTES):
             raise ConnectionError("the broker sent something before it was asked")
-        if isinstance(broker.failure, OSError):
-            raise broker.failure
+        if isinstance(broker.error, OSError):
+            raise broker.error
 
 
 def _raise_for(code: int) -> None:

@@ -12,7 +12,7 @@ flusher: a process that is stopped in between would send it when it goes on. Thi
 names of nats-py (see docs/dependencies.md); `tests/scanner/test_batch.py` checks them with the real
 server.
 
-The texts are not checked here. `publishing` creates them from device ids that `registry` checked.
+The texts are not checked here. `scanner.publish` creates them from device ids that were checked.
 """
 
 from __future__ import annotations

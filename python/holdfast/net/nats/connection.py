@@ -22,7 +22,7 @@ from nats.js.errors import APIError, ServiceUnavailableError
 from holdfast.events import log_lines
 from holdfast.net.nats import batch
 from holdfast.net.nats.credentials import Credentials
-from holdfast.net.nats.pings import PING_INTERVAL_S, PINGS_OUTSTANDING
+from holdfast.net.nats.ping_defaults import PING_INTERVAL_S, PINGS_OUTSTANDING
 from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.net.secret_file import read_secret
 from holdfast.net.secure_channel import SecureChannel, failure_text
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 Handler: TypeAlias = "Callable[[Msg], Awaitable[None]]"
 
 FIRST_PAUSE_S = 0.25
-MAX_PAUSE = 2.0
+MAX_PAUSE_S = 2.0
 """Seconds between attempts to connect. Each failure doubles the pause, up to the maximum."""
 
 LOG_INTERVAL_S = 600.0
@@ -55,7 +55,7 @@ CLOSE_TIMEOUT_S = 1.5
 
 NO_JETSTREAM = "JetStream is not enabled on the server or for this account"
 
-ANSWERING = 3.0
+FIRST_ANSWER_TIMEOUT_S = 3.0
 """Seconds in which servers must answer the first request of a command."""
 
 
@@ -112,7 +112,7 @@ class Ping:
 
 
 @dataclass(eq=False)
-class Broker:
+class NatsConnection:
     """Keeps a connection to NATS. Calls `handlers` for messages of their subjects."""
 
     servers: Servers
@@ -120,14 +120,14 @@ class Broker:
     connected: Callable[[SafeClient | None], None]
     ping: Ping
     _: KW_ONLY
-    name: str = "holdfast scan"
+    name: str
     """What the server shows of the connection."""
     shared: Collection[str] = ()
     """The subjects whose messages go to one of all members of `queue`."""
     queue: str = ""
     until_member: Callable[[], Awaitable[object]] | None = None
     """Returns when this is a member of `queue`: what it gets before, no other member gets."""
-    max_pause_s: float = MAX_PAUSE
+    max_pause_s: float = MAX_PAUSE_S
     """Seconds between attempts to connect."""
 
     def __post_init__(self) -> None:
@@ -304,7 +304,7 @@ def nats_reason(error: Exception) -> str:
 
 @asynccontextmanager
 async def connected_once(
-    servers: Servers, name: str, within_s: float = ANSWERING
+    servers: Servers, name: str, within_s: float = FIRST_ANSWER_TIMEOUT_S
 ) -> AsyncIterator[SafeClient]:
     """A connection for one command, which is not made again after its end.
 

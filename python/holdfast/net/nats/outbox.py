@@ -68,7 +68,7 @@ class Outbox:
         self.replaced = 0
         """Messages that a newer one of the same tag replaced."""
         self.dropped = 0
-        """Messages lost because too many were kept."""
+        """Messages lost: too many waited, or this node may not publish any more."""
 
     def connected(self, client: SafeClient | None) -> None:
         """Sets the client for further messages; `None` while there is no connection."""

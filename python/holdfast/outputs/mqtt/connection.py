@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.models.services import BrokerConfig
     from holdfast.net.mqtt.packets import Publish
-    from holdfast.net.mqtt.selector import Waiter
+    from holdfast.net.mqtt.waiter import Waiter
     from holdfast.outputs.mqtt.delivery import Delivery
 
 FIRST_IDENTIFIER, LAST_IDENTIFIER = 5000, 65535
@@ -234,10 +234,10 @@ class Connection(BrokerClient):
         """Reads what has arrived. Returns whether some deliveries are done."""
         connection = self.connection
         data = connection.receive_from_broker(READ_BYTES)
-        if connection.failure is not None:
-            is_closed = isinstance(connection.failure, EOFError)
+        if connection.error is not None:
+            is_closed = isinstance(connection.error, EOFError)
             lost = "" if is_closed else "the connection was lost: "
-            self.end(f"{lost}{connection.failure}")
+            self.end(f"{lost}{connection.error}")
             return False
         if QUICK_ACK is not None:
             # A broker that writes each confirmation by itself waits for an acknowledgement by TCP
@@ -253,7 +253,7 @@ class Connection(BrokerClient):
                 self._pings.answered()
                 news |= self._confirm(self._pinged)
             elif self.pass_on(first, body) != MQTTErrorCode.MQTT_ERR_SUCCESS:
-                self.end(self.trouble or "the broker sent a malformed packet")
+                self.end(self.end_reason or "the broker sent a malformed packet")
             if not connection.is_open:
                 break
         return news

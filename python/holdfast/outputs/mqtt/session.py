@@ -14,7 +14,7 @@ from paho.mqtt.reasoncodes import ReasonCode
 
 from holdfast.events import log_lines
 from holdfast.net.mqtt.dial import CONNACK_TIMEOUT_S
-from holdfast.net.mqtt.selector import Ended, Waiter
+from holdfast.net.mqtt.waiter import Ended, Waiter
 from holdfast.net.secure_channel import failure_text
 from holdfast.outputs import sender
 from holdfast.outputs.mqtt.connection import Connection
@@ -83,7 +83,7 @@ class Session:
         self._news = threading.Condition(self._lock)
         self._new: list[Delivery] = []
         self._topics: list[tuple[Sequence[str], bool]] = []
-        self._reason: str | None = None
+        self._end_reason: str | None = None
         self._is_over = False
         self._client_id = client_id
         self._waiter = Waiter(self._end)
@@ -100,7 +100,7 @@ class Session:
     @property
     def error(self) -> str | None:
         """Why the connection is over; `None` if it is not."""
-        return self._reason if self._is_over else None
+        return self._end_reason if self._is_over else None
 
     def publish(self, messages: Sequence[Message]) -> Delivery:
         """Publishes messages after those before."""
@@ -183,7 +183,7 @@ class Session:
                         )
                     self._step(connection, waiter)
                 if not connection.is_accepted:
-                    reason = self._reason or connection.trouble
+                    reason = self._end_reason or connection.end_reason
                     raise ConnectionError(reason or "the broker closed the connection")
             except Ended:
                 raise ConnectionError("stopped") from None
@@ -216,14 +216,14 @@ class Session:
             elif self._ending is Ending.DISCONNECT:
                 connection.disconnect()
         except (OSError, ValueError) as error:
-            self._reason = failure_text(error)
+            self._end_reason = failure_text(error)
         except Exception as error:  # Nothing that a broker sends may end the output.
             log_lines.problem("mqtt_failed", broker=self._settings.url)
-            self._reason = type(error).__name__
+            self._end_reason = type(error).__name__
         finally:
             connection.close()
-            reason = connection.trouble or self._reason or "the connection was lost"
-            self._reason = self._client_id.explained(reason, connection)
+            reason = connection.end_reason or self._end_reason or "the connection was lost"
+            self._end_reason = self._client_id.explained(reason, connection)
             self._waiter.close()
             with self._news:
                 self._is_over = True
@@ -232,7 +232,7 @@ class Session:
     def _step(self, connection: Connection, waiter: Waiter) -> None:
         """Waits once, then reads and writes."""
         open_socket = connection.connection
-        pending = open_socket.failure is not None
+        pending = open_socket.error is not None
         readable, writable = waiter.wait(
             open_socket.connection,
             read=True,
@@ -270,5 +270,5 @@ class Session:
         reason: ReasonCode,
         _properties: Properties | None,
     ) -> None:
-        if self._reason is None and flags.is_disconnect_packet_from_server:
-            self._reason = f"the broker ended the connection: {reason}"
+        if self._end_reason is None and flags.is_disconnect_packet_from_server:
+            self._end_reason = f"the broker ended the connection: {reason}"

@@ -12,7 +12,7 @@ from nats.errors import Error, NoRespondersError
 from nats.errors import TimeoutError as NoAnswer
 from nats.js.errors import NotFoundError
 
-from holdfast.net.nats.connection import ANSWERING, connected_once, nats_reason
+from holdfast.net.nats.connection import FIRST_ANSWER_TIMEOUT_S, connected_once, nats_reason
 from holdfast.replication.leases.bucket import Holding, LeaseBucket
 from holdfast.replication.leases.times import LEASE_TIMES
 from holdfast.scanner.fleet.partition_leases import NODE, PARTITION, leases_of
@@ -91,7 +91,7 @@ class FleetObserver:
             connecting = connected_once(self._servers, "holdfast fleet")
             began = time.monotonic()
             self._client = await exit_stack.enter_async_context(connecting)
-            left = began + ANSWERING - time.monotonic()
+            left = began + FIRST_ANSWER_TIMEOUT_S - time.monotonic()
             bucket, is_read = LeaseBucket(self._client, leases_of(self._fleet)), asyncio.Event()
             try:
                 async with asyncio.timeout(max(left, 0.0)):
@@ -148,7 +148,7 @@ class FleetObserver:
         is_known = node in (await self.look()).nodes
         try:
             where = subject(prefix, node, "drain")
-            answer = await ask(self._client, where, b"", Answer, ANSWERING)
+            answer = await ask(self._client, where, b"", Answer, FIRST_ANSWER_TIMEOUT_S)
         except (Error, OSError) as error:
             # A stream that records the subject is a responder, also if there is no such node.
             if isinstance(error, NoRespondersError if is_known else (NoRespondersError, NoAnswer)):

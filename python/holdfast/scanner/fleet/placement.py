@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from holdfast import _core
 from holdfast.events import log_lines
-from holdfast.net.nats.connection import Broker
+from holdfast.net.nats.connection import NatsConnection
 from holdfast.net.nats.outbox import Outbox
 from holdfast.scanner.fleet import shutdown
 from holdfast.scanner.fleet.agreement import Terms
@@ -141,7 +141,7 @@ class FleetPlacement(FleetMember):
     async def _connect_leases(self, connected: Callable[[Client | None], None]) -> None:
         """Keeps a connection that only the leases use."""
         settings = self._settings
-        broker = Broker(
+        broker = NatsConnection(
             settings.servers,
             {},
             connected,

@@ -27,9 +27,9 @@ class Waiter:
 
     def __init__(self, stop: Stop) -> None:
         self._stop = stop
-        self._bell, self._rope = socket.socketpair()
-        self._rope.setblocking(False)
-        self._bell.setblocking(False)
+        self._wake_reader, self._wake_writer = socket.socketpair()
+        self._wake_writer.setblocking(False)
+        self._wake_reader.setblocking(False)
         stop.then(self.wake)
 
     def __enter__(self) -> Self:
@@ -41,13 +41,13 @@ class Waiter:
     def close(self) -> None:
         """Ends the use of this waiter."""
         self._stop.forget(self.wake)
-        self._bell.close()
-        self._rope.close()
+        self._wake_reader.close()
+        self._wake_writer.close()
 
     def wake(self) -> None:
         """Ends the current or the next wait. Thread-safe."""
         with contextlib.suppress(OSError):
-            self._rope.send(b"\0")
+            self._wake_writer.send(b"\0")
 
     def check(self) -> None:
         """Raises `Ended` if `stop` is set."""
@@ -61,13 +61,13 @@ class Waiter:
         self.check()
         interest = selectors.EVENT_READ * read | selectors.EVENT_WRITE * write
         with _Selector() as selector:
-            selector.register(self._bell, selectors.EVENT_READ)
+            selector.register(self._wake_reader, selectors.EVENT_READ)
             if interest:
                 selector.register(for_this, interest)
             ready = {key.fileobj: events for key, events in selector.select(max(0.0, seconds))}
         self.check()
-        if self._bell in ready:
+        if self._wake_reader in ready:
             with contextlib.suppress(BlockingIOError):
-                self._bell.recv(4096)
+                self._wake_reader.recv(4096)
         events = ready.get(for_this, 0)
         return bool(events & selectors.EVENT_READ), bool(events & selectors.EVENT_WRITE)
