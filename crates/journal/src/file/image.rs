@@ -32,8 +32,8 @@ pub(super) struct Page {
     pub bytes: Vec<u8>,
 }
 
-/// The key of a page in the file. Files may have more pages than a number has values: then their pages are
-/// those of further areas.
+/// The key of a page in the file. The files of a memory may have more pages than its number has values: page numbers
+/// above 65535 continue in the next area number.
 pub(super) fn page_key(memory: u16, area: usize, number: usize) -> (u16, u8, u16) {
     (memory, (area + (number >> u16::BITS)) as u8, number as u16)
 }

@@ -1,4 +1,4 @@
-//! With another `sync`: what has changed is stored every so many seconds.
+//! With a `sync` above 0: what has changed is stored each time that `sync` has passed.
 
 use std::fmt;
 use std::sync::Arc;
@@ -24,7 +24,7 @@ pub(super) struct Periodic {
     pub memories: Vec<Arc<Memory>>,
     /// Their numbers in the file.
     pub ids: Vec<u16>,
-    /// No step ever waits in it.
+    /// Of which only the stop is needed: no step ever waits in it.
     pub queue: Arc<Queue>,
     pub sync: Duration,
     /// How many writes to the memories are in the file.

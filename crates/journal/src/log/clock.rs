@@ -13,7 +13,7 @@ pub(super) enum Clock {
     Test(std::sync::Arc<std::sync::Mutex<Duration>>),
 }
 
-/// A time of the clock: nanoseconds since a moment before the process began. Never 0.
+/// A time of the clock: nanoseconds since an arbitrary moment, so only differences mean something. Never 0.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(super) struct Moment(u64);
 

@@ -1,4 +1,4 @@
-//! The settings of a log that are not given. Each number is beside the rule that uses it.
+//! The settings of a log that are not given. Most numbers are beside the rule that uses them.
 
 use std::time::Duration;
 

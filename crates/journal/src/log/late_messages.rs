@@ -7,25 +7,26 @@ use std::time::Duration;
 
 use super::clock::Moment;
 
-/// How far the clock of the stream is ahead of that of this machine, at least, in nanoseconds. `None` before the
-/// first message.
+/// A lower bound of how far the clock of the stream is ahead of that of this machine, in nanoseconds. `None` before
+/// the first message.
 #[derive(Debug, Default)]
 pub(super) struct StreamLead(Option<i64>);
 
 impl StreamLead {
-    /// The stream had stored a message before it was applied. One that arrives late says less than one before.
+    /// The stream had stored a message before it was applied: a lower bound. Of these, the highest counts, as the
+    /// message that was on its way for the shortest time gives it.
     pub(super) fn applied(&mut self, stored: i64, now: Moment) {
         self.0 = self.0.max(Some(lead_over(stored, now)));
     }
 
-    /// The stream has stored a message after this node sent it. The lead was longer before the clock of the stream
-    /// was set back.
+    /// The stream has stored a message after this node sent it: an upper bound. A bound above it is from before the
+    /// clock of the stream was set back.
     pub(super) fn sent(&mut self, stored: i64, at: Moment) {
         self.0 = self.0.min(Some(lead_over(stored, at)));
     }
 
-    /// When the stream may store steps at the latest for which this is left, by its own clock. It is short by what
-    /// the fastest message took to arrive.
+    /// The time in `left`, by the clock of the stream. With a lower bound of the lead it comes early: by the time
+    /// that the fastest message took from the stream to this node.
     pub(super) fn deadline(&self, now: Moment, left: Duration) -> i64 {
         let lead = self.0.expect("steps are taken once a message was applied");
         lead.saturating_add_unsigned(now.as_nanos())

@@ -13,8 +13,8 @@
 //!
 //! In `parts`, `thread.rs` runs sessions, and `session.rs` joins the parts of a node (`node.rs`): `applier.rs`,
 //! `sender.rs`, `snapshotter.rs`, `comparer.rs`, `continuity.rs` for seals after a restart, and
-//! `wrong_contents.rs` for a node whose contents were wrong. `session_start.rs` is for the beginning of a session, and `applied_file.rs` for a node with a
-//! file. `stream/messages.rs` reads the stream.
+//! `wrong_contents.rs` for a node whose contents were wrong. `session_start.rs` is for the beginning of a session,
+//! and `applied_file.rs` for a node with a file. `stream/messages.rs` reads the stream.
 
 mod clock;
 mod defaults;
@@ -89,8 +89,8 @@ impl Log {
         Ok(Log { settings, members, shared, thread, note })
     }
 
-    /// Begins with the contents that the memories have now, with the note that came with them. A log that
-    /// does not lead to them is an error then.
+    /// Begins with the contents that the memories have now, and the note that came with them. The log fails
+    /// later if these contents do not follow from its messages.
     ///
     /// # Errors
     /// [`LogError`] for a note that is not of this log.

@@ -87,7 +87,7 @@ impl Continuity {
         };
     }
 
-    /// A message of this node was applied. `own` is its number if it was sent by this process.
+    /// A message of any node was applied. `own` is its number if this process has sent it.
     pub(in crate::log) fn applied(
         &mut self,
         state: &State,

@@ -37,8 +37,8 @@ const NO_ROOM: [ErrorCode; 4] = [
 /// A message has room for this many bytes of protocol, beside its payload.
 const HEADER_BYTES: usize = 1024;
 
-/// The distance between two starts, at most. Starts were microseconds of Unix time once: as long as they
-/// stay behind the clock, such a version still follows this one.
+/// The distance between two starts, at most. Older releases take the microseconds of Unix time as a start: with
+/// distances as short as this, which is about a second, it is still greater if one of them follows.
 const MAX_START_DISTANCE: u64 = 1 << 20;
 
 /// Numbers messages and keeps them until their outcome is known.
@@ -230,8 +230,8 @@ impl Sender {
         Ok(())
     }
 
-    /// Sends a message without steps, with a notice if there is one: when it is applied, the contents have all that the log had when it
-    /// was sent. Returns its number.
+    /// Sends a message without steps, with a notice if there is one: when it is applied, the contents have all
+    /// that the log had when it was sent. Returns its number.
     pub(in crate::log) async fn send_probe(
         &mut self,
         publisher: &mut Publisher,

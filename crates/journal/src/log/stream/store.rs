@@ -330,7 +330,8 @@ impl Store {
         }
     }
 
-    /// What the key of the snapshots names, after something has failed. `None` if the servers don't say.
+    /// What the key of the snapshots names: asked now and then, and after something has failed. `None` if the
+    /// servers don't say.
     ///
     /// # Errors
     /// [`End`] if they have lost the key, or a bucket of the log.
@@ -363,7 +364,7 @@ impl Store {
     }
 
     /// Stores a snapshot and names it the newest, if the newest is still the one of `seen`. Removes all other
-    /// snapshots but the one before it, and the messages from before that one.
+    /// snapshots but the previous one, and the messages older than that one.
     pub(in crate::log) async fn put(
         &self,
         seen: Option<(u64, Pointer)>,
