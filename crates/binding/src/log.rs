@@ -156,7 +156,7 @@ impl Log {
         shown.set_item("steps", status.steps)?;
         shown.set_item("unavailable", status.unavailable)?;
         shown.set_item("not_confirmed", status.not_confirmed)?;
-        shown.set_item("not_stored", status.not_stored)?;
+        shown.set_item("not_stored", status.too_large)?;
         shown.set_item("refused", status.refused)?;
         shown.set_item("stale", status.stale)?;
         shown.set_item("ignored", status.ignored)?;

@@ -1307,7 +1307,7 @@ fn a_step_that_no_message_holds_is_refused() {
     let refused = nodes[0].memory.write_many(Access::Ingest, &writes).unwrap_err();
     let Refusal::TooLarge { bytes: found, most } = refused.refusal else { panic!("{refused}") };
     assert!(found > 9 * bytes.len() && (bytes.len()..9 * bytes.len()).contains(&most), "{refused}");
-    assert_eq!(nodes[0].status().not_stored, 1);
+    assert_eq!(nodes[0].status().too_large, 1);
 }
 
 /// A process that was stopped has old contents when it goes on, and its connection looks sound.

@@ -190,7 +190,7 @@ impl Log {
             steps: counters.steps.get(),
             unavailable: counters.unavailable.get(),
             not_confirmed: counters.not_confirmed.get(),
-            not_stored: counters.not_stored.get(),
+            too_large: counters.too_large.get(),
             refused: counters.refused.get(),
             stale: counters.stale.get(),
             ignored: counters.ignored.get(),

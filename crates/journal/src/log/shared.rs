@@ -102,7 +102,7 @@ impl Journal for Shared {
         // The servers would end the connection: no later attempt could succeed either.
         let most = self.max_step_bytes.load(Ordering::Relaxed);
         if bytes.len() > most {
-            self.counters.not_stored.add();
+            self.counters.too_large.add();
             return refuse(done, Refusal::TooLarge { bytes: bytes.len(), most });
         }
         let mut queue = lock(&self.queue);

@@ -7,6 +7,7 @@ use holdfast_runtime::Counter;
 
 use super::error::LogError;
 
+/// Those of [`Status`].
 #[derive(Debug, Default)]
 pub(super) struct Counters {
     pub(super) sequence: Counter,
@@ -14,7 +15,7 @@ pub(super) struct Counters {
     pub(super) steps: Counter,
     pub(super) unavailable: Counter,
     pub(super) not_confirmed: Counter,
-    pub(super) not_stored: Counter,
+    pub(super) too_large: Counter,
     pub(super) refused: Counter,
     pub(super) stale: Counter,
     pub(super) ignored: Counter,
@@ -81,9 +82,12 @@ pub struct Status {
     pub last_sequence: u64,
     /// Steps of this node that were carried out.
     pub steps: u64,
+    /// Steps of this node that were not sent, or that the stream has not taken: they are never carried out.
     pub unavailable: u64,
+    /// Steps of this node that may be carried out, but this was not known in time.
     pub not_confirmed: u64,
-    pub not_stored: u64,
+    /// Steps of this node that the servers would not accept, as they are too long. Users see it as `not_stored`.
+    pub too_large: u64,
     /// Steps of this node that a memory refused when it was their turn.
     pub refused: u64,
     /// Messages that were applied before, or that a later start of their node has overtaken.

@@ -32,7 +32,8 @@ struct Message {
     steps: Vec<Done>,
     first_sent: Moment,
     attempts: u32,
-    until: Instant,
+    /// When its steps are answered as not confirmed; `None` if it was sent without steps.
+    until: Option<Instant>,
 }
 
 impl InFlight {
@@ -40,8 +41,9 @@ impl InFlight {
         self.open < MAX_OPEN_MESSAGES
     }
 
-    pub(in crate::log) fn is_empty(&self) -> bool {
-        self.open == 0
+    /// Whether a step was not answered.
+    pub(in crate::log) fn has_open_steps(&self) -> bool {
+        self.open > 0
     }
 
     pub(in crate::log) fn push(
@@ -49,7 +51,7 @@ impl InFlight {
         (counter, payload): (u64, Bytes),
         steps: Vec<Done>,
         first_sent: Moment,
-        until: Instant,
+        until: Option<Instant>,
     ) {
         debug_assert!(self.messages.back().is_none_or(|last| last.counter < counter));
         if self.messages.len() >= MAX_REMEMBERED_MESSAGES
@@ -109,7 +111,7 @@ impl InFlight {
     }
 
     /// The servers refused the message. Whether it was stored is not known for sure.
-    pub(in crate::log) fn not_stored(&mut self, counter: u64, counters: &Counters) {
+    pub(in crate::log) fn refused_by_stream(&mut self, counter: u64, counters: &Counters) {
         self.answer(counter, Refusal::NotConfirmed, &counters.not_confirmed);
     }
 
@@ -145,8 +147,8 @@ impl InFlight {
 
     /// Answers steps that were not confirmed in time.
     pub(in crate::log) fn expire(&mut self, now: Instant, counters: &Counters) {
-        // A probe that was sent before a step may have to be confirmed later than the step.
-        for message in self.messages.iter_mut().filter(|message| message.until <= now) {
+        let is_late = |message: &&mut Message| message.until.is_some_and(|until| until <= now);
+        for message in self.messages.iter_mut().filter(is_late) {
             let steps = message.take_steps();
             self.open -= usize::from(!steps.is_empty());
             refuse_all(steps, Refusal::NotConfirmed, &counters.not_confirmed);
@@ -198,7 +200,7 @@ mod tests {
         let (sender, receiver) = channel();
         let done: Done = Box::new(move |outcome| sender.send(outcome).unwrap());
         let message = (counter, Bytes::from_static(b"steps"));
-        in_flight.push(message, vec![done], Clock::default().now(), until);
+        in_flight.push(message, vec![done], Clock::default().now(), Some(until));
         receiver
     }
 
@@ -220,7 +222,7 @@ mod tests {
         assert_eq!(two.try_recv(), Ok(Ok(read)));
         assert!(three.try_recv().is_err());
         assert_eq!((counters.steps.get(), counters.unavailable.get()), (1, 1));
-        assert!(!in_flight.is_empty());
+        assert!(in_flight.has_open_steps());
     }
 
     #[test]
@@ -286,7 +288,7 @@ mod tests {
         in_flight.not_taken(2, &counters);
         assert_eq!(two.try_recv(), Ok(refused(Refusal::Unavailable)));
         let three = push(&mut in_flight, 3, later());
-        in_flight.not_stored(3, &counters);
+        in_flight.refused_by_stream(3, &counters);
         assert_eq!(three.try_recv(), Ok(refused(Refusal::NotConfirmed)));
     }
 }

@@ -216,7 +216,7 @@ impl Sender {
         &mut self,
         publisher: &mut Publisher,
     ) -> Result<(), End> {
-        if self.shared.is_stopping() && self.in_flight.is_empty() {
+        if self.shared.is_stopping() && !self.in_flight.has_open_steps() {
             return Err(End::Stopped);
         }
         // While many messages are in flight, steps gather in the queue: batches grow with the load.
@@ -237,7 +237,6 @@ impl Sender {
         publisher: &mut Publisher,
         compares: bool,
         notice: Option<Notice>,
-        until: Instant,
     ) -> Result<u64, End> {
         self.counter += 1;
         let origin = self.origin(self.counter);
@@ -245,7 +244,7 @@ impl Sender {
             Some(notice) => message::encode_notice(&origin, compares, notice),
             None => message::encode(&origin, compares, None, std::iter::empty()),
         };
-        self.publish(publisher, payload, Vec::new(), until).await
+        self.publish(publisher, payload, Vec::new(), None).await
     }
 
     async fn send(&mut self, publisher: &mut Publisher, batch: Batch) -> Result<u64, End> {
@@ -257,7 +256,7 @@ impl Sender {
         if self.settings.answers_early {
             dones.drain(..).for_each(|done| done(Ok(CarriedOut::default())));
         }
-        self.publish(publisher, payload, dones, until).await
+        self.publish(publisher, payload, dones, Some(until)).await
     }
 
     /// Publishes the next message.
@@ -266,7 +265,7 @@ impl Sender {
         publisher: &mut Publisher,
         payload: Bytes,
         dones: Vec<Done>,
-        until: Instant,
+        until: Option<Instant>,
     ) -> Result<u64, End> {
         let counter = self.counter;
         // Before it is published: if that fails, the next session sends it again.
@@ -298,7 +297,7 @@ impl Sender {
             self.in_flight.not_taken(counter, &self.shared.counters);
             self.report("the stream has no leader");
         } else if let Some(error) = refusal(&ack.payload) {
-            self.in_flight.not_stored(counter, &self.shared.counters);
+            self.in_flight.refused_by_stream(counter, &self.shared.counters);
             let description = error.description.as_deref().unwrap_or("no reason");
             self.report(&format!("the stream refuses messages: {description}"));
             if NO_ROOM.contains(&error.err_code) {
@@ -336,8 +335,9 @@ impl Sender {
         self.expire(Instant::now() + self.settings.write_timeout);
     }
 
+    /// Whether all steps that were sent are answered.
     pub(in crate::log) fn is_idle(&self) -> bool {
-        self.in_flight.is_empty()
+        !self.in_flight.has_open_steps()
     }
 }
 
@@ -501,7 +501,7 @@ mod tests {
         let over = Instant::now();
         sender.applied(&origin("b", 1), 100 * SECOND, Vec::new()).unwrap();
         sender.ensure_start(0).unwrap();
-        sender.in_flight.push((1, Bytes::new()), Vec::new(), sender.shared.now(), over);
+        sender.in_flight.push((1, Bytes::new()), Vec::new(), sender.shared.now(), None);
         pass(2);
         let own = origin("a", sender.start.number());
         sender.applied(&own, 50 * SECOND, Vec::new()).unwrap();

@@ -214,7 +214,7 @@ impl<'n> Session<'n> {
         node.sender.resend(publisher).await?;
         let compares = !node.rejoin.contents_are_right();
         let notice = node.continuity.question();
-        let counter = node.sender.send_probe(publisher, compares, notice, self.began).await?;
+        let counter = node.sender.send_probe(publisher, compares, notice).await?;
         self.catch_up = CatchUp::Announced { counter };
         Ok(())
     }
@@ -232,8 +232,7 @@ impl<'n> Session<'n> {
 
     /// Sends a message without steps, with or without a notice. Returns its number.
     async fn notify(&mut self, notice: Option<Notice>) -> Result<u64, End> {
-        let until = Instant::now() + self.node.settings.write_timeout;
-        self.node.sender.send_probe(&mut self.publisher, false, notice, until).await
+        self.node.sender.send_probe(&mut self.publisher, false, notice).await
     }
 
     async fn send_waiting(&mut self) -> Result<(), End> {
@@ -364,9 +363,8 @@ impl<'n> Session<'n> {
     async fn reported(&mut self, report: Report) -> Result<(), End> {
         match report {
             Report::Leased(Ok(true)) => {
-                let until = Instant::now() + self.node.settings.write_timeout;
                 let Node { sender, snapshotter, .. } = &mut *self.node;
-                let counter = sender.send_probe(&mut self.publisher, true, None, until).await?;
+                let counter = sender.send_probe(&mut self.publisher, true, None).await?;
                 snapshotter.requested(counter);
             }
             Report::Leased(Ok(false)) => self.node.snapshotter.postpone(),
