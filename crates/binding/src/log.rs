@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use holdfast_journal::log::{
-    Log as Core, LogError as CoreError, LogReader as CoreReader, Login, Phase, Record, Settings,
-    Tls, Until, check_name, check_node,
+    ClientIdentity, Log as Core, LogError as CoreError, LogReader as CoreReader, Login, Phase,
+    Record, Settings, Tls, Until, check_name, check_node,
 };
 use holdfast_memory::{Access, Action, Memory as CoreMemory, Step, StepWrite};
 use holdfast_runtime::lock;
@@ -93,7 +93,7 @@ impl Log {
         }
         if let Some(digest_steps) = digest_steps {
             let most = u32::MAX as usize;
-            settings.digest_every = within("digest_steps", digest_steps, 1..=most)? as u64;
+            settings.digest_steps = within("digest_steps", digest_steps, 1..=most)? as u64;
         }
         if let Some(cut_off) = cut_off {
             settings.max_cut_off = seconds("cut_off", cut_off)?;
@@ -114,7 +114,7 @@ impl Log {
         let began = Instant::now();
         self.core.start().map_err(to_py_err)?;
         loop {
-            let most = if self.core.is_asking() { timeout + ASKING } else { timeout };
+            let most = if self.core.awaits_seal_answer() { timeout + ASKING } else { timeout };
             let left = most.saturating_sub(began.elapsed()).min(SLICE);
             let caught_up =
                 py.detach(|| self.core.wait_until_caught_up(left)).map_err(to_py_err)?;
@@ -123,7 +123,7 @@ impl Log {
             }
             let signalled = py.check_signals();
             if signalled.is_err() || began.elapsed() >= most {
-                let error = self.core.no_connection(most);
+                let error = self.core.startup_timeout_error(most);
                 py.detach(|| self.core.stop());
                 return signalled.and(Err(to_py_err(error)));
             }
@@ -355,12 +355,12 @@ fn login(
 }
 
 fn tls_of((ca, cert, key): TlsFiles) -> PyResult<Tls> {
-    let own = match (cert, key) {
-        (Some(cert), Some(key)) => Some((cert, key)),
+    let identity = match (cert, key) {
+        (Some(cert), Some(key)) => Some(ClientIdentity { cert, key }),
         (None, None) => None,
         _ => return Err(PyValueError::new_err("tls: give certificate and key, or neither")),
     };
-    Ok(Tls { ca, own })
+    Ok(Tls { ca, identity })
 }
 
 fn to_py_err(error: CoreError) -> PyErr {

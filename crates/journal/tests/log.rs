@@ -253,7 +253,7 @@ fn without_a_server_nothing_starts_and_the_error_says_why() {
     let node = Node::new(&[&server], "a", |_| {});
     node.log.start().unwrap();
     assert!(!node.log.wait_until_caught_up(Duration::from_millis(300)).unwrap());
-    let error = node.log.no_connection(Duration::from_millis(300));
+    let error = node.log.startup_timeout_error(Duration::from_millis(300));
     assert_eq!(error.kind(), "no_connection");
     assert!(error.to_string().contains("connect"), "{error}");
     assert_eq!(node.write(0, 1), Err(Refusal::Unavailable));
@@ -937,7 +937,7 @@ fn values_of_a_device_that_a_node_replays_have_no_age_and_later_ones_that_of_the
 
 /// Digests are compared often.
 fn often(settings: &mut Settings) {
-    settings.digest_every = 5;
+    settings.digest_steps = 5;
 }
 
 /// As before, and a node whose contents are wrong does not return by itself.

@@ -108,13 +108,13 @@ fn a_node_that_gave_no_answer_is_sealed_again_with_the_one_that_has_started() {
     b.log.stop();
     let waiting = node(&server, "b", DEADLINE * 10);
     waiting.log.start().unwrap();
-    until("the other node asks", || waiting.log.is_asking());
-    let error = waiting.log.no_connection(DEADLINE).to_string();
+    until("the other node asks", || waiting.log.awaits_seal_answer());
+    let error = waiting.log.startup_timeout_error(DEADLINE).to_string();
     assert!(error.contains("no other node has said"), "{error}");
     let a = started(&server, "a");
     assert_eq!(a.read(0), Err(Refusal::Sealed));
     assert!(waiting.log.wait_until_caught_up(DEADLINE).unwrap());
-    assert!(!waiting.log.is_asking());
+    assert!(!waiting.log.awaits_seal_answer());
     assert_eq!(waiting.read(0), Err(Refusal::Sealed));
 }
 
@@ -144,7 +144,7 @@ fn a_node_whose_contents_were_wrong_while_it_asked_serves_when_it_knows() {
     let node = |name| {
         Node::with(sealed(GateMode::Once), &[&server], name, |settings| {
             settings.answer_timeout = DEADLINE * 10;
-            settings.digest_every = COMPARED;
+            settings.digest_steps = COMPARED;
         })
     };
     let before = names.map(node);
@@ -157,13 +157,13 @@ fn a_node_whose_contents_were_wrong_while_it_asked_serves_when_it_knows() {
     let nodes = names.map(node);
     nodes.iter().for_each(|node| node.log.start().unwrap());
     let wrong = &nodes[2];
-    until("all ask", || nodes.iter().all(|node| node.log.is_asking()));
+    until("all ask", || nodes.iter().all(|node| node.log.awaits_seal_answer()));
     let mut contents = Memory::contents(std::slice::from_ref(&wrong.memory)).remove(0);
     contents.areas[2][1] ^= 1;
     wrong.memory.restore(&contents);
     let is_returning = || matches!(wrong.status().phase, Phase::Returning(_));
     until("its contents are found wrong", is_returning);
-    until("it asks again", || wrong.log.is_asking());
+    until("it asks again", || wrong.log.awaits_seal_answer());
     // It waits no longer, and closes the seals.
     started(&server, "d");
     until("its contents are right", || !is_returning());

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::parts::comparer::DIGEST_EVERY;
+use super::parts::comparer::DIGEST_STEPS;
 use super::parts::continuity::ANSWER_TIMEOUT;
 use super::parts::lost_messages::MAX_CUT_OFF;
 use super::parts::session::EXAMINE_EVERY;
@@ -35,7 +35,7 @@ impl Settings {
             snapshot_steps: SNAPSHOT_STEPS,
             snapshot_bytes: SNAPSHOT_BYTES,
             examine_every: EXAMINE_EVERY,
-            digest_every: DIGEST_EVERY,
+            digest_steps: DIGEST_STEPS,
             rejoin_after: Some(REJOIN_AFTER),
             memory_file: None,
             max_cut_off: MAX_CUT_OFF,

@@ -43,7 +43,9 @@ use holdfast_runtime::{OwnThreads, lock};
 pub use defaults::{MAX_LAG, WRITE_TIMEOUT};
 pub use error::LogError;
 pub use log_reader::{LogReader, Record, Until};
-pub use settings::{CONTACTS_PER_LAG, Login, Servers, Settings, Tls, check_name, check_node};
+pub use settings::{
+    CONTACTS_PER_LAG, ClientIdentity, Login, Servers, Settings, Tls, check_name, check_node,
+};
 pub use shared::Checkpoint;
 pub use status::{Digest, Event, Node, Phase, Status};
 pub use stream::message::Origin;
@@ -151,14 +153,14 @@ impl Log {
     }
 
     /// Whether it has applied all that the log had, and waits for other nodes to say whether seals stay open.
-    pub fn is_asking(&self) -> bool {
+    pub fn awaits_seal_answer(&self) -> bool {
         let view = self.shared.view();
-        view.is_asking && view.server.is_some()
+        view.awaits_seal_answer && view.server.is_some()
     }
 
-    /// The error that says why the log did not catch up within a time.
-    pub fn no_connection(&self, within: Duration) -> LogError {
-        let last = if self.is_asking() {
+    /// The error of a start in which the log did not catch up within this time: it says why.
+    pub fn startup_timeout_error(&self, within: Duration) -> LogError {
+        let last = if self.awaits_seal_answer() {
             "no other node has said whether seals stay open, and they could not be closed"
                 .to_owned()
         } else {

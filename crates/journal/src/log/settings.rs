@@ -37,8 +37,14 @@ pub enum Login {
 pub struct Tls {
     /// The trusted authorities, in place of those of the system.
     pub ca: Option<PathBuf>,
-    /// The certificate and the key of this client.
-    pub own: Option<(PathBuf, PathBuf)>,
+    pub identity: Option<ClientIdentity>,
+}
+
+/// With what this client proves to the servers who it is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ClientIdentity {
+    pub cert: PathBuf,
+    pub key: PathBuf,
 }
 
 #[derive(Debug, Clone)]
@@ -65,7 +71,7 @@ pub struct Settings {
     #[doc(hidden)]
     pub examine_every: Duration,
     /// Digests are compared at sequences that are multiples of this.
-    pub digest_every: u64,
+    pub digest_steps: u64,
     /// A node whose contents differ rejoins by itself, unless it has done so within this time; with
     /// `None`, never.
     pub rejoin_after: Option<Duration>,
@@ -101,7 +107,7 @@ impl Settings {
             return refused(format!("replicas is {}, allowed: 1, 3, 5", self.replicas));
         }
         for (what, found) in
-            [("snapshot_steps", self.snapshot_steps), ("digest_steps", self.digest_every)]
+            [("snapshot_steps", self.snapshot_steps), ("digest_steps", self.digest_steps)]
         {
             if found == 0 {
                 return refused(format!("{what} is 0, at least 1 is required"));
@@ -117,13 +123,13 @@ impl Settings {
     }
 
     /// How often a node without writes proves its contact with the log.
-    pub(super) fn tick(&self) -> Duration {
+    pub(super) fn contact_interval(&self) -> Duration {
         self.max_lag / CONTACTS_PER_LAG
     }
 
     /// How long a session may have no contact before another one is tried.
-    pub(super) fn silence(&self) -> Duration {
-        (self.tick() * 3).max(Duration::from_secs(2))
+    pub(super) fn max_silence(&self) -> Duration {
+        (self.contact_interval() * 3).max(Duration::from_secs(2))
     }
 }
 

@@ -40,7 +40,7 @@ pub(super) struct View {
     pub(super) phase: Phase,
     pub(super) server: Option<String>,
     /// It has applied all that the log had, and waits for other nodes to say whether seals stay open.
-    pub(super) is_asking: bool,
+    pub(super) awaits_seal_answer: bool,
     pub(super) last_error: Option<String>,
     pub(super) replicas: usize,
     pub(super) digest: Option<Digest>,

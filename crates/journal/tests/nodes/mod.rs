@@ -234,7 +234,7 @@ impl Node {
     pub fn try_start(&self) -> Result<(), LogError> {
         self.log.start()?;
         let caught_up = self.log.wait_until_caught_up(DEADLINE)?;
-        if caught_up { Ok(()) } else { Err(self.log.no_connection(DEADLINE)) }
+        if caught_up { Ok(()) } else { Err(self.log.startup_timeout_error(DEADLINE)) }
     }
 
     pub fn status(&self) -> Status {

@@ -150,7 +150,7 @@ fn node_of_a_log() {
             }
             "snapshots" => {
                 settings.snapshot_steps = 300;
-                settings.digest_every = 500;
+                settings.digest_steps = 500;
             }
             _ => panic!("unknown option {option}"),
         }

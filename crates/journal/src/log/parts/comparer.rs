@@ -16,7 +16,7 @@ use crate::log::status::{Digest, Event};
 use crate::log::stream::store::{DIGEST_KEY_PREFIX, Pointer};
 
 /// Nodes compare their digests at sequences that are multiples of this.
-pub(in crate::log) const DIGEST_EVERY: u64 = 10_000;
+pub(in crate::log) const DIGEST_STEPS: u64 = 10_000;
 
 /// The length of a digest as text.
 const DIGEST_CHARS: usize = 64;
@@ -62,7 +62,7 @@ impl Comparer {
 
     /// Whether all nodes compare their digests at this sequence, although none of them asks for it.
     pub(in crate::log) fn is_due(&self, sequence: u64) -> bool {
-        sequence.is_multiple_of(self.settings.digest_every)
+        sequence.is_multiple_of(self.settings.digest_steps)
     }
 
     /// Stores the digest of this node for the others, and compares it.

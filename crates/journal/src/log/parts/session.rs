@@ -116,7 +116,7 @@ impl<'n> Session<'n> {
         let (stream_end, replicas) = (info.state.last_sequence, info.config.num_replicas);
         let server = connected.server.clone();
         node.shared.event(Event::new("log_connected", &[("server", &server)]));
-        node.shared.update(|view| (view.server, view.is_asking) = (Some(server), false));
+        node.shared.update(|view| (view.server, view.awaits_seal_answer) = (Some(server), false));
         node.learn_replicas(replicas);
         let (background, reports) = Background::new(store);
         let (now, catch_up) = (Instant::now(), CatchUp::Reading);
@@ -191,7 +191,7 @@ impl<'n> Session<'n> {
     /// Lets a consumer deliver the next messages: all that were fetched lately are harmless.
     async fn consume(&mut self, messages: &mut Messages) -> Result<(), End> {
         let from = self.node.applier.sequence() + 1;
-        let heartbeat = (self.node.settings.silence() / 4).max(MIN_HEARTBEAT);
+        let heartbeat = (self.node.settings.max_silence() / 4).max(MIN_HEARTBEAT);
         let consumer = self.background.store().consume(from, heartbeat);
         messages.consume(self.node.run_with_expiry(consumer).await??);
         Ok(())
@@ -278,7 +278,7 @@ impl<'n> Session<'n> {
             let Node { shared, applier, continuity, .. } = &mut *self.node;
             self.catch_up = CatchUp::Applied { sequence: applier.sequence() };
             continuity.joined(applier.state(), self.last_applied);
-            shared.update(|view| view.is_asking = !continuity.is_known());
+            shared.update(|view| view.awaits_seal_answer = !continuity.is_known());
         }
     }
 
@@ -290,7 +290,7 @@ impl<'n> Session<'n> {
         self.catch_up = CatchUp::CaughtUp;
         let Node { shared, rejoin, .. } = &mut *self.node;
         shared.open(self.publisher.max_steps_bytes());
-        shared.update(|view| view.is_asking = false);
+        shared.update(|view| view.awaits_seal_answer = false);
         shared.event(Event::new("log_caught_up", &[("sequence", &sequence.to_string())]));
         if rejoin.caught_up(sequence) {
             shared.update(|view| {
@@ -422,7 +422,7 @@ impl<'n> Session<'n> {
         }
         let silent = now.saturating_duration_since(self.last_applied.max(self.began));
         // A server that is cut off from the stream may keep the connection open for long.
-        if silent > self.node.settings.silence() {
+        if silent > self.node.settings.max_silence() {
             self.check_end().await?;
             let seconds = silent.as_secs_f64();
             let mut reason = format!("the log has confirmed nothing for {seconds:.1} s");
@@ -470,8 +470,12 @@ impl<'n> Session<'n> {
         let (last, pause) = match self.catch_up {
             CatchUp::Reading => return Ok(()),
             // Seldom: a message that closes seals does not count behind it, whoever sends the one or the other.
-            CatchUp::Applied { .. } => (last_sent.max(self.last_applied), settings.silence() / 2),
-            CatchUp::Announced { .. } | CatchUp::CaughtUp => (last_sent, settings.tick()),
+            CatchUp::Applied { .. } => {
+                (last_sent.max(self.last_applied), settings.max_silence() / 2)
+            }
+            CatchUp::Announced { .. } | CatchUp::CaughtUp => {
+                (last_sent, settings.contact_interval())
+            }
         };
         if now.saturating_duration_since(last) >= pause {
             let question = continuity.question();

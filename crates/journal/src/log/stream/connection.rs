@@ -70,8 +70,9 @@ pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<C
                 Some(file) => options.add_root_certificates(certificates(file)?),
                 None => options,
             };
-            match &tls.own {
-                Some((cert, own)) => options.add_client_certificate(certificates(cert)?, key(own)?),
+            match &tls.identity {
+                Some(identity) => options
+                    .add_client_certificate(certificates(&identity.cert)?, key(&identity.key)?),
                 None => options,
             }
         }
