@@ -21,6 +21,11 @@ const UNDER_LEASE: u8 = 0x80;
 /// In the order of their numbers.
 const ACCESSES: [Access; 4] = [Access::Client, Access::Ingest, Access::Mirror, Access::Restore];
 
+// The numbers of actions.
+const WRITE: u8 = 0;
+const MASK: u8 = 1;
+const WRITE_THEN_READ: u8 = 2;
+
 /// Why bytes are not a step for some memories.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 pub enum DecodeError {
@@ -65,19 +70,19 @@ pub fn encode(step: &Step, out: &mut Vec<u8>) {
     }
     match &step.action {
         Action::Write(writes) => {
-            out.push(0);
+            out.push(WRITE);
             for write in writes {
                 encode_write(write, out);
             }
         }
         &Action::Mask { member, area, address, and_mask, or_mask } => {
-            out.push(1);
+            out.push(MASK);
             encode_place(member, area, address, out);
             out.extend_from_slice(&and_mask.to_le_bytes());
             out.extend_from_slice(&or_mask.to_le_bytes());
         }
         &Action::WriteThenRead { ref write, area, address, count } => {
-            out.push(2);
+            out.push(WRITE_THEN_READ);
             encode_place(write.member, area, address, out);
             out.extend_from_slice(&encoded_count(count).to_le_bytes());
             encode_write(write, out);
@@ -123,27 +128,27 @@ pub fn decode(bytes: &[u8], members: &[Arc<Memory>]) -> Result<Step, DecodeError
     }
     let (access, tenure) = rest.writer()?;
     let action = match rest.bytes.try_get_u8()? {
-        0 => {
+        WRITE => {
             let mut writes = Vec::new();
             while !rest.bytes.is_empty() {
                 writes.push(rest.write()?);
             }
             Action::Write(writes)
         }
-        1 => {
+        MASK => {
             let (member, area, address) = rest.place()?;
             if area.is_bits() {
                 return Err(DecodeError::Mask(area));
             }
-            rest.holds((member, area, address), 1)?;
+            rest.check_range((member, area, address), 1)?;
             let and_mask = rest.bytes.try_get_u16_le()?;
             let or_mask = rest.bytes.try_get_u16_le()?;
             Action::Mask { member, area, address, and_mask, or_mask }
         }
-        2 => {
+        WRITE_THEN_READ => {
             let place = rest.place()?;
             let count = rest.bytes.try_get_u32_le()?;
-            rest.holds(place, count)?;
+            rest.check_range(place, count)?;
             let write = rest.write()?;
             let (member, area, address) = place;
             if member != write.member {
@@ -192,7 +197,7 @@ impl<'a> Rest<'a> {
         Ok((member, area, self.bytes.try_get_u16_le()?))
     }
 
-    fn holds(
+    fn check_range(
         &self,
         (member, area, address): (u16, Area, u16),
         count: u32,
@@ -207,7 +212,7 @@ impl<'a> Rest<'a> {
     fn write(&mut self) -> Result<StepWrite, DecodeError> {
         let place = self.place()?;
         let count = self.bytes.try_get_u32_le()?;
-        self.holds(place, count)?;
+        self.check_range(place, count)?;
         let (member, area, address) = place;
         let count = count as usize;
         let bytes =

@@ -18,7 +18,7 @@ use super::status::Status;
 /// The newest version of the format: a memory may have files.
 pub const VERSION: u64 = 2;
 /// The version of a file while no memory in it has had files: older programs read it.
-const WITHOUT_FILES: u64 = 1;
+const FIRST_VERSION: u64 = 1;
 
 const ABOUT: TableDefinition<&str, u64> = TableDefinition::new("holdfast");
 const FORMAT: &str = "format";
@@ -179,7 +179,7 @@ fn create(disk: &dyn Disk, image: &Image) -> Result<Database, FileError> {
 fn create_beside(disk: &dyn Disk, image: &Image) -> Result<Database, FileError> {
     let database = disk.create(&builder())?;
     let transaction = database.begin_write()?;
-    transaction.open_table(ABOUT)?.insert(FORMAT, WITHOUT_FILES)?;
+    transaction.open_table(ABOUT)?.insert(FORMAT, FIRST_VERSION)?;
     let memories = image.memories.clone();
     let note = image.note.clone().map(Some);
     write(&transaction, &Changes { memories, note, ..Changes::default() })?;
@@ -231,7 +231,7 @@ fn contents(database: &Database) -> Result<Image, FileError> {
         about => about?,
     };
     match about.get(FORMAT)?.map(|version| version.value()) {
-        Some(WITHOUT_FILES..=VERSION) => {}
+        Some(FIRST_VERSION..=VERSION) => {}
         Some(found) if found > VERSION => {
             return Err(FileError::Newer { found, allowed: VERSION });
         }

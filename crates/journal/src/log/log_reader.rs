@@ -15,7 +15,7 @@ use crate::log::stream::connection::connect;
 use crate::log::stream::message::{self, Origin};
 use crate::log::stream::messages::{Fetched, fetched};
 use crate::log::stream::raw_message::Received;
-use crate::log::stream::store::{Pointer, Snapshot, Store};
+use crate::log::stream::store::{OpenAs, Pointer, Snapshot, Store};
 
 /// Where to end.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -81,7 +81,8 @@ impl LogReader {
             let name = format!("holdfast log replay {}", settings.name);
             let connected = connect(&settings.servers, name).await?;
             let context = jetstream::new(connected.client);
-            let store = Store::open(&context, settings, &fingerprint(&members), false).await?;
+            let store =
+                Store::open(&context, settings, &fingerprint(&members), OpenAs::Reader).await?;
             let last = store.stream.cached_info().state.last_sequence;
             let Some((_, pointer)) = store.pointer().await? else {
                 return Err(LogError::Snapshot("the log has no snapshot".to_owned()).into());

@@ -14,6 +14,7 @@ use super::clock::{Clock, Moment};
 use super::error::LogError;
 use super::settings::Settings;
 use super::status::{Counters, Event, Node, Phase, View};
+use super::stream::message::STEP_LEN_BYTES;
 use crate::encoding;
 
 /// The most steps that wait to be sent, and their bytes.
@@ -221,7 +222,7 @@ impl Shared {
         let mut queue = lock(&self.queue);
         let (mut count, mut len) = (0, 0);
         for waiting in &queue.steps {
-            len += waiting.bytes.len() + 4;
+            len += waiting.bytes.len() + STEP_LEN_BYTES;
             // The first always: a step longer than `room` is sent alone.
             if count > 0 && len > room {
                 break;

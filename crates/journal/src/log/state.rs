@@ -17,7 +17,7 @@ use super::late_messages::is_late;
 use super::lease_terms::LeaseTerms;
 use super::settings::is_word;
 use crate::log::stream::message::{
-    self, MAX_NODES, Message, MessageError, Notice, Origin, VERSION, WITH_LEASES, WITHOUT_LEASES,
+    self, FIRST_VERSION, MAX_NODES, Message, MessageError, Notice, Origin, VERSION, WITH_LEASES,
 };
 
 /// An encoded state begins with it.
@@ -178,7 +178,7 @@ impl State {
 
     /// The version of the encoded state.
     pub(super) fn version(&self) -> u8 {
-        if self.terms.is_empty() { WITHOUT_LEASES } else { WITH_LEASES }
+        if self.terms.is_empty() { FIRST_VERSION } else { WITH_LEASES }
     }
 
     /// How long the contents are.
@@ -227,7 +227,7 @@ impl State {
         let malformed = || LogError::Snapshot("the snapshot of the log is malformed".to_owned());
         let bytes = bytes.strip_prefix(&MARK).ok_or_else(malformed)?;
         let (&found, mut rest) = bytes.split_first().ok_or_else(malformed)?;
-        if !(WITHOUT_LEASES..=WITH_LEASES).contains(&found) {
+        if !(FIRST_VERSION..=WITH_LEASES).contains(&found) {
             let what = "the snapshot of the log";
             return Err(LogError::Version { what, found, supported: WITH_LEASES });
         }
@@ -331,10 +331,10 @@ mod tests {
     #[test]
     fn a_state_without_leases_is_read_by_older_nodes() {
         let mut state = State::new(vec![member()]);
-        assert_eq!(state.encode()[3], WITHOUT_LEASES);
+        assert_eq!(state.encode()[3], FIRST_VERSION);
         let tenure = |epoch, since| Some(Tenure { lease: 7, term: Term { epoch, since } });
         state.terms.admit(None).unwrap();
-        assert_eq!(state.version(), WITHOUT_LEASES);
+        assert_eq!(state.version(), FIRST_VERSION);
         state.terms.admit(tenure(1, 5)).unwrap();
         let saved = state.encode();
         assert_eq!(saved[3], WITH_LEASES);

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::log::error::LogError;
 use crate::log::shared::Checkpoint;
 use crate::log::state::{Place, State, digest_of};
-use crate::log::stream::message::{WITH_LEASES, WITHOUT_LEASES};
+use crate::log::stream::message::{FIRST_VERSION, WITH_LEASES};
 
 /// Which message of which log contents come from, and what a node has to know to go on from there.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -38,7 +38,7 @@ impl Note {
         }
         let malformed = |_| LogError::Snapshot("the note of the log is malformed".to_owned());
         let Versioned { version: found } = serde_json::from_slice(bytes).map_err(malformed)?;
-        if !(WITHOUT_LEASES..=WITH_LEASES).contains(&found) {
+        if !(FIRST_VERSION..=WITH_LEASES).contains(&found) {
             let what = "the note of the log";
             return Err(LogError::Version { what, found, supported: WITH_LEASES });
         }

@@ -27,7 +27,7 @@ use crate::log::stream::connection::{Connected, REQUEST_TIMEOUT, connect};
 use crate::log::stream::message::{MAX_NODES, MessageError, Notice};
 use crate::log::stream::messages::Messages;
 use crate::log::stream::raw_message::Received;
-use crate::log::stream::store::{DIGEST_KEY_PREFIX, SNAPSHOT_KEY, Store, parsed};
+use crate::log::stream::store::{DIGEST_KEY_PREFIX, OpenAs, SNAPSHOT_KEY, Store, parsed};
 
 /// The most further messages that are applied before steps are sent.
 const MAX_FURTHER_MESSAGES: usize = 255;
@@ -514,7 +514,7 @@ async fn open_store(node: &mut Node, client: &Client) -> Result<Store, End> {
         let text = "the servers do not have the stream of the log any more: they have lost it";
         return Err(lags(node, text.to_owned()));
     }
-    node.run_with_expiry(Store::open(&context, &settings, &fingerprint, true)).await?
+    node.run_with_expiry(Store::open(&context, &settings, &fingerprint, OpenAs::Node)).await?
 }
 
 /// Anyone may write keys whose headers end the connection. They would end each session. And whoever may

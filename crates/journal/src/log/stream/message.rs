@@ -13,17 +13,25 @@ use crate::log::settings::is_word;
 
 const MARK: [u8; 3] = *b"HFL";
 
-/// The newest version of messages: with a [`Notice`]. Older nodes would not close the seals that all others do.
-pub(in crate::log) const VERSION: u8 = 4;
+// Each message and snapshot has the oldest version that can express it, so that older nodes read it.
+
+/// The first version of messages, snapshots and streams. Nothing in it is under a lease.
+pub(in crate::log) const FIRST_VERSION: u8 = 1;
+
+/// The version of messages with steps under leases, and the newest one of snapshots.
+pub(in crate::log) const WITH_LEASES: u8 = 2;
 
 /// The version of messages with a deadline. Older nodes would carry out what all others refuse.
 const WITH_DEADLINE: u8 = 3;
 
-/// The version of messages without a deadline, and the newest one of snapshots: steps may be under leases.
-pub(in crate::log) const WITH_LEASES: u8 = 2;
+/// The version of messages with a [`Notice`]. Older nodes would not close the seals that all others do.
+const WITH_NOTICE: u8 = 4;
 
-/// The version of messages and snapshots without leases: older nodes read it.
-pub(in crate::log) const WITHOUT_LEASES: u8 = 1;
+/// The newest version of messages.
+pub(in crate::log) const VERSION: u8 = WITH_NOTICE;
+
+/// The number of bytes before each step: its length.
+pub(in crate::log) const STEP_LEN_BYTES: usize = size_of::<u32>();
 
 /// The node that sent a message, and the number of the message.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -110,7 +118,7 @@ pub(in crate::log) const OVERHEAD_BYTES: usize = 128;
 /// Encodes a message with a notice.
 pub(in crate::log) fn encode_notice(origin: &Origin, compares: bool, notice: Notice) -> Bytes {
     let mut out = Vec::with_capacity(OVERHEAD_BYTES);
-    encode_head(VERSION, origin, compares, &mut out);
+    encode_head(WITH_NOTICE, origin, compares, &mut out);
     let (kind, sequence) = notice.encoded();
     out.push(kind);
     out.extend_from_slice(&sequence.to_le_bytes());
@@ -124,13 +132,13 @@ pub(in crate::log) fn encode<'a>(
     deadline: Option<i64>,
     steps: impl ExactSizeIterator<Item = &'a [u8]> + Clone,
 ) -> Bytes {
-    let len: usize = steps.clone().map(|step| step.len() + 4).sum();
+    let len: usize = steps.clone().map(|step| step.len() + STEP_LEN_BYTES).sum();
     let mut out = Vec::with_capacity(len + OVERHEAD_BYTES);
     let has_leases = steps.clone().any(encoding::is_under_lease);
     let version = match deadline {
         Some(_) => WITH_DEADLINE,
         None if has_leases => WITH_LEASES,
-        None => WITHOUT_LEASES,
+        None => FIRST_VERSION,
     };
     encode_head(version, origin, compares, &mut out);
     if let Some(deadline) = deadline {
@@ -159,7 +167,7 @@ pub(in crate::log) fn decode(
 ) -> Result<Message, MessageError> {
     let mut bytes = bytes.strip_prefix(&MARK).ok_or(MessageError::Foreign)?;
     let version = bytes.try_get_u8().or(Err(MessageError::Foreign))?;
-    if !(WITHOUT_LEASES..=VERSION).contains(&version) {
+    if !(FIRST_VERSION..=VERSION).contains(&version) {
         return Err(MessageError::Version(version));
     }
     let compares = match bytes.try_get_u8() {
@@ -167,7 +175,7 @@ pub(in crate::log) fn decode(
         _ => return Err(MessageError::Malformed),
     };
     let origin = origin(&mut bytes).ok_or(MessageError::Malformed)?;
-    if version == VERSION {
+    if version == WITH_NOTICE {
         let notice = Notice::decode(&mut bytes).filter(|_| bytes.is_empty());
         let notice = Some(notice.ok_or(MessageError::Malformed)?);
         return Ok(Message { origin, compares, deadline: None, notice, steps: Vec::new() });
@@ -266,7 +274,7 @@ mod tests {
 
         #[test]
         fn any_bytes_are_a_message_or_an_error(
-            version in prop::option::of(WITHOUT_LEASES..=VERSION),
+            version in prop::option::of(FIRST_VERSION..=VERSION),
             mut bytes in prop::collection::vec(any::<u8>(), 0..100),
         ) {
             if let Some(version) = version {

@@ -22,7 +22,7 @@ use crate::log::error::{End, LogError};
 use crate::log::layout::difference;
 use crate::log::settings::Settings;
 use crate::log::state::{Place, State, digest_of};
-use crate::log::stream::message::{MAX_NODES, VERSION, WITHOUT_LEASES};
+use crate::log::stream::message::{FIRST_VERSION, MAX_NODES, VERSION};
 use crate::log::stream::raw_message::{Received, fetch};
 
 /// Within this time, the servers themselves notice a message that was sent twice.
@@ -57,6 +57,15 @@ pub(in crate::log) struct Store {
     /// Of a node; `None` for a reader.
     leases: Option<kv::Store>,
     objects: ObjectStore,
+}
+
+/// Who opens what a log keeps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::log) enum OpenAs {
+    /// Makes what does not exist.
+    Node,
+    /// Makes nothing, and needs no leases: a backup does not have them.
+    Reader,
 }
 
 /// Names the snapshots of a log.
@@ -103,7 +112,7 @@ fn stream_name(log: &str) -> String {
 }
 
 impl Store {
-    /// Opens what the log keeps, and makes what does not exist.
+    /// Opens what the log keeps. A node makes what does not exist.
     ///
     /// The stream and its fingerprint are made in one request, and only the first one succeeds: all
     /// nodes see the same fingerprint.
@@ -111,14 +120,14 @@ impl Store {
         context: &Context,
         settings: &Settings,
         fingerprint: &str,
-        create: bool,
+        open_as: OpenAs,
     ) -> Result<Store, End> {
         let name = stream_name(&settings.name);
         let missing = |error: &dyn std::fmt::Display| End::lost("the stream of the log", error);
         let stream = match context.get_stream(&name).await {
             Ok(stream) => stream,
             Err(error) if is_missing(&error.kind()) => {
-                if !create {
+                if open_as == OpenAs::Reader {
                     let text = format!("the servers have no log {:?}", settings.name);
                     return Err(LogError::Settings(text).into());
                 }
@@ -135,16 +144,18 @@ impl Store {
         };
         check(stream.cached_info(), fingerprint)?;
         let bucket = |suffix: &str| format!("{name}{suffix}");
-        let pointers = keys(context, settings, bucket(""), Duration::ZERO, create).await?;
-        // Only nodes need it, so a backup does not have it.
-        let leases = if create {
-            Some(keys(context, settings, bucket("-leases"), LEASE_TTL, create).await?)
-        } else {
-            None
+        let pointers = keys(context, settings, bucket(""), Duration::ZERO, open_as).await?;
+        let leases = match open_as {
+            OpenAs::Node => {
+                Some(keys(context, settings, bucket("-leases"), LEASE_TTL, open_as).await?)
+            }
+            OpenAs::Reader => None,
         };
         let objects = match context.get_object_store(bucket("")).await {
             Ok(objects) => objects,
-            Err(error) if !create => return Err(End::lost("the snapshots of the log", error)),
+            Err(error) if open_as == OpenAs::Reader => {
+                return Err(End::lost("the snapshots of the log", error));
+            }
             Err(_) => {
                 let config = object_store::Config {
                     bucket: bucket(""),
@@ -442,7 +453,7 @@ pub(in crate::log) fn parsed(pointer: &[u8]) -> Result<Pointer, LogError> {
 fn config(settings: &Settings, fingerprint: &str) -> Config {
     let id = format!("{:032x}", unique());
     let metadata = [
-        (META_VERSION, WITHOUT_LEASES.to_string()),
+        (META_VERSION, FIRST_VERSION.to_string()),
         (META_LAYOUT, fingerprint.to_owned()),
         (META_ID, id),
     ];
@@ -493,7 +504,7 @@ fn check(info: &Info, fingerprint: &str) -> Result<(), LogError> {
         return Err(LogError::Settings(text));
     };
     let found = version.parse().unwrap_or(u8::MAX);
-    if !(WITHOUT_LEASES..=VERSION).contains(&found) {
+    if !(FIRST_VERSION..=VERSION).contains(&found) {
         return Err(LogError::Version { what: "the log", found, supported: VERSION });
     }
     difference(layout, fingerprint).map_or(Ok(()), |difference| Err(LogError::Layout(difference)))
@@ -504,12 +515,12 @@ async fn keys(
     settings: &Settings,
     bucket: String,
     max_age: Duration,
-    create: bool,
+    open_as: OpenAs,
 ) -> Result<kv::Store, End> {
     let lost = |error: &dyn std::fmt::Display| End::lost("the keys of the log", error);
     match context.get_key_value(&bucket).await {
         Ok(keys) => Ok(keys),
-        Err(error) if !create => Err(lost(&error)),
+        Err(error) if open_as == OpenAs::Reader => Err(lost(&error)),
         Err(_) => {
             let config = kv::Config {
                 bucket: bucket.clone(),
