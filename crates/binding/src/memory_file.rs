@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::UNIX_EPOCH;
 
 use holdfast_journal::file::{
-    FileError, FileOnDisk, Member, MemoryFile as Core, Options, Source, read, release,
+    CheckpointSource, FileError, FileOnDisk, Member, MemoryFile as Core, Options, read, release,
 };
 use holdfast_journal::log::{Checkpoint, Log as CoreLog};
 use pyo3::exceptions::{PyOSError, PyValueError};
@@ -33,8 +33,8 @@ pub struct MemoryFile {
 #[derive(Debug)]
 struct OfLog(Arc<CoreLog>);
 
-impl Source for OfLog {
-    fn contents(&self) -> Option<Checkpoint> {
+impl CheckpointSource for OfLog {
+    fn checkpoint(&self) -> Option<Checkpoint> {
         self.0.checkpoint()
     }
 }
@@ -80,7 +80,8 @@ impl MemoryFile {
 
     #[pyo3(signature = (log=None))]
     fn start(&self, py: Python<'_>, log: Option<PyRef<'_, Log>>) -> PyResult<()> {
-        let log = log.map(|log| Arc::new(OfLog(Arc::clone(&log.core))) as Arc<dyn Source>);
+        let log =
+            log.map(|log| Arc::new(OfLog(Arc::clone(&log.core))) as Arc<dyn CheckpointSource>);
         py.detach(|| self.core.start(log)).map_err(|error| to_py_err(&self.path, error))
     }
 

@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use holdfast_journal::file::{FileError, FileOnDisk, Member, MemoryFile, Options, Source, read};
+use holdfast_journal::file::{
+    CheckpointSource, FileError, FileOnDisk, Member, MemoryFile, Options, read,
+};
 use holdfast_journal::log::{Checkpoint, LogError, LogReader, Settings, Until};
 use holdfast_memory::{Contents, Gate, GateMode, Layout, Memory, Refusal, Span};
 use nodes::{Folder, Node, Server, memory, memory_of, until};
@@ -25,8 +27,8 @@ impl std::fmt::Debug for OfNode {
     }
 }
 
-impl Source for OfNode {
-    fn contents(&self) -> Option<Checkpoint> {
+impl CheckpointSource for OfNode {
+    fn checkpoint(&self) -> Option<Checkpoint> {
         self.0.log.checkpoint()
     }
 }

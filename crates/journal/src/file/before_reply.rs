@@ -12,7 +12,7 @@ use holdfast_memory::{Action, Area, Memory, Outcome, Refusal, Step};
 
 use super::error::FileError;
 use super::image::{Changes, PAGE_BYTES, Page};
-use super::queue::{Next, Queue, Waiting};
+use super::queue::{Next, Queue, QueuedStep};
 use super::store::Store;
 
 pub(super) struct BeforeReply {
@@ -49,10 +49,10 @@ impl BeforeReply {
         }
     }
 
-    fn carry_out(&mut self, steps: Vec<Waiting>) {
+    fn carry_out(&mut self, steps: Vec<QueuedStep>) {
         let mut touched = BTreeSet::new();
         let mut outcomes: Vec<Outcome> = Vec::with_capacity(steps.len());
-        for Waiting { step, .. } in &steps {
+        for QueuedStep { step, .. } in &steps {
             let outcome = step.carry_out(&self.shadows);
             // A refused step has changed nothing.
             if outcome.is_ok() {
@@ -60,7 +60,7 @@ impl BeforeReply {
             }
             outcomes.push(outcome);
         }
-        let pages = touched.into_iter().filter_map(|place| self.changed(place)).collect();
+        let pages = touched.into_iter().filter_map(|page| self.changed(page)).collect();
         // The memories have not changed yet: only the shadows are ahead.
         let stored = self.store.store(Changes { pages, ..Changes::default() });
         self.queue.stored();
@@ -68,7 +68,7 @@ impl BeforeReply {
             self.restore_shadows();
             return self.queue.refuse(steps.into_iter().map(|each| each.done), Refusal::NotStored);
         }
-        for (Waiting { step, done }, expected) in steps.into_iter().zip(outcomes) {
+        for (QueuedStep { step, done }, expected) in steps.into_iter().zip(outcomes) {
             let outcome = step.carry_out(&self.memories);
             debug_assert_eq!(outcome, expected, "a step does the same to equal memories");
             done(outcome);
@@ -76,12 +76,12 @@ impl BeforeReply {
     }
 
     /// Notes the pages that a step writes.
-    fn touch(&self, step: &Step, touched: &mut BTreeSet<Place>) {
+    fn touch(&self, step: &Step, touched: &mut BTreeSet<MemberPage>) {
         let mut note = |member: u16, area: Area, address: u16, count: usize| {
             let written = self.shadows[usize::from(member)].layout().bytes(area, address, count);
             let (area, bytes) = written.expect("a step is valid for its memories");
             let numbers = bytes.start / PAGE_BYTES..=(bytes.end - 1) / PAGE_BYTES;
-            touched.extend(numbers.map(|number| Place { member, area, number }));
+            touched.extend(numbers.map(|number| MemberPage { member, area, number }));
         };
         match &step.action {
             Action::Write(writes) => {
@@ -97,7 +97,7 @@ impl BeforeReply {
     }
 
     /// A page of a shadow, unless it is in the file already.
-    fn changed(&self, Place { member, area, number }: Place) -> Option<Page> {
+    fn changed(&self, MemberPage { member, area, number }: MemberPage) -> Option<Page> {
         let (shadow, memory) = (&self.shadows[usize::from(member)], self.ids[usize::from(member)]);
         let (first, len) = (number * PAGE_BYTES, shadow.layout().byte_lens()[area]);
         let bytes = shadow.bytes(area, first..len.min(first + PAGE_BYTES));
@@ -112,9 +112,9 @@ impl BeforeReply {
     }
 }
 
-/// Where a page is.
+/// A page of a member.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Place {
+struct MemberPage {
     member: u16,
     area: usize,
     number: usize,

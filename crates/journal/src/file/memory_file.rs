@@ -16,7 +16,7 @@ use super::before_reply::BeforeReply;
 use super::disk::Disk;
 use super::error::FileError;
 use super::image::{Changes, Image, StoredMemory};
-use super::periodic::{Periodic, Source, writes};
+use super::periodic::{CheckpointSource, Periodic, writes};
 use super::queue::{Queue, QueueLimits};
 use super::shrunk_memory::SET_ASIDE;
 use super::status::Status;
@@ -199,7 +199,7 @@ impl MemoryFile {
     ///
     /// # Errors
     /// [`FileError`] if the contents can't be stored, or the log has none. They are then still not stored.
-    pub fn start(&self, log: Option<Arc<dyn Source>>) -> Result<(), FileError> {
+    pub fn start(&self, log: Option<Arc<dyn CheckpointSource>>) -> Result<(), FileError> {
         let mut state = self.state();
         let State::Loaded(store) = &mut *state else { return Ok(()) };
         let memories: Vec<_> = self.members.iter().map(|m| Arc::clone(&m.memory)).collect();
@@ -212,7 +212,7 @@ impl MemoryFile {
             let (contents, note) = match &log {
                 None => (Memory::contents(&memories), None),
                 Some(log) => {
-                    log.contents().map(|(contents, note)| (contents, Some(note))).ok_or_else(
+                    log.checkpoint().map(|(contents, note)| (contents, Some(note))).ok_or_else(
                         || FileError::OfLog("the log has no contents to store".to_owned()),
                     )?
                 }

@@ -37,7 +37,7 @@ pub use error::FileError;
 pub use image::StoredMemory;
 pub use memory_file::{Member, MemoryFile, Options};
 pub use overlay::Overlay;
-pub use periodic::Source;
+pub use periodic::CheckpointSource;
 pub use queue::QueueLimits;
 pub use shrunk_memory::release;
 pub use status::Status;

@@ -13,10 +13,10 @@ use super::queue::{Next, Queue};
 use super::store::Store;
 
 /// A log that changes the memories of a file.
-pub trait Source: fmt::Debug + Send + Sync {
+pub trait CheckpointSource: fmt::Debug + Send + Sync {
     /// The contents of all memories after one message, in the order of their names, and what the log has
     /// to know to go on from there. `None` while there are no contents that are right.
-    fn contents(&self) -> Option<(Vec<Contents>, Vec<u8>)>;
+    fn checkpoint(&self) -> Option<(Vec<Contents>, Vec<u8>)>;
 }
 
 pub(super) struct Periodic {
@@ -30,7 +30,7 @@ pub(super) struct Periodic {
     /// How many writes to the memories are in the file.
     pub stored_writes: Arc<AtomicU64>,
     /// What changes the memories, if a log does.
-    pub log: Option<Arc<dyn Source>>,
+    pub log: Option<Arc<dyn CheckpointSource>>,
 }
 
 impl Periodic {
@@ -52,7 +52,7 @@ impl Periodic {
         }
         let (contents, note) = match &self.log {
             None => (Memory::contents(&self.memories), None),
-            Some(log) => match log.contents() {
+            Some(log) => match log.checkpoint() {
                 Some((contents, note)) => (contents, Some(Some(note))),
                 // What the file has stays the last that was right.
                 None => return Ok(()),

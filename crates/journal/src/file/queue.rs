@@ -11,7 +11,7 @@ use holdfast_runtime::lock;
 use super::status::Status;
 
 /// A step, and the receiver of its outcome.
-pub(super) struct Waiting {
+pub(super) struct QueuedStep {
     pub step: Step,
     pub done: Done,
 }
@@ -40,7 +40,7 @@ impl QueueLimits {
 
 struct State {
     phase: Phase,
-    waiting: Vec<Waiting>,
+    waiting: Vec<QueuedStep>,
     bytes: usize,
     /// How many steps were taken and are not answered: the disk may keep them waiting.
     taken: usize,
@@ -58,7 +58,7 @@ enum Phase {
 
 /// What is to be done next.
 pub(super) enum Next {
-    Steps(Vec<Waiting>),
+    Steps(Vec<QueuedStep>),
     /// Nothing happened in the given time.
     Idle,
     /// Nothing waits any more, and nothing will.
@@ -163,7 +163,7 @@ impl Journal for Queue {
                 // A step that is larger than the queue waits alone.
                 if fits || state.waiting.is_empty() {
                     state.bytes = bytes;
-                    state.waiting.push(Waiting { step, done });
+                    state.waiting.push(QueuedStep { step, done });
                     drop(state);
                     return self.changed.notify_one();
                 }
@@ -183,7 +183,7 @@ fn size(step: &Step) -> usize {
         Action::WriteThenRead { write, .. } => std::slice::from_ref(write),
     };
     let of_writes = writes.iter().map(|write| mem::size_of_val(write) + write.bytes.len());
-    mem::size_of::<Waiting>() + of_writes.sum::<usize>()
+    mem::size_of::<QueuedStep>() + of_writes.sum::<usize>()
 }
 
 impl std::fmt::Debug for State {

@@ -5,9 +5,9 @@ use std::time::Duration;
 use super::parts::comparer::DIGEST_STEPS;
 use super::parts::continuity::ANSWER_TIMEOUT;
 use super::parts::lost_messages::MAX_CUT_OFF;
+use super::parts::rejoin::REJOIN_AFTER;
 use super::parts::session::EXAMINE_EVERY;
 use super::parts::snapshotter::{SNAPSHOT_BYTES, SNAPSHOT_STEPS};
-use super::parts::wrong_contents::REJOIN_AFTER;
 use super::settings::{Login, Servers, Settings};
 use super::stream::connection::CONNECT_TIMEOUT;
 

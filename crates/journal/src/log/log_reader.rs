@@ -10,7 +10,7 @@ use holdfast_memory::{Access, Action, Gate, Memory, Outcome, Refusal, Step, Step
 use super::error::{End, LogError, missing};
 use super::layout::fingerprint;
 use super::settings::Settings;
-use super::state::{Applied, Place, State, digest_of};
+use super::state::{Applied, State, StreamPosition, digest_of};
 use crate::log::stream::connection::connect;
 use crate::log::stream::message::{self, Origin};
 use crate::log::stream::messages::{Fetched, fetched};
@@ -115,7 +115,7 @@ impl LogReader {
             Until::Time(_) => Some(self.last),
             Until::Forever => None,
         };
-        if self.ended || end.is_some_and(|end| self.reading.state.place.sequence >= end) {
+        if self.ended || end.is_some_and(|end| self.reading.state.position.sequence >= end) {
             self.ended = true;
             return Ok(None);
         }
@@ -139,12 +139,12 @@ impl LogReader {
 
     /// The sequence that was applied last.
     pub fn sequence(&self) -> u64 {
-        self.reading.state.place.sequence
+        self.reading.state.position.sequence
     }
 
     /// When the stream stored the message that was applied last, in nanoseconds of Unix time.
     pub fn stored(&self) -> i64 {
-        self.reading.state.place.stored
+        self.reading.state.position.stored
     }
 
     /// The last sequence that the stream had when this began.
@@ -169,24 +169,24 @@ impl Reading {
 
     /// `None` at a message that was stored after the end.
     async fn next(&mut self, until: Until) -> Result<Option<Record>, End> {
-        let next = self.state.place.sequence + 1;
+        let next = self.state.position.sequence + 1;
         loop {
             let received = self.messages.next().await;
             let ended = || Err(End::Lost("the messages have ended".to_owned()));
-            let Received { place, payload, .. } = received.unwrap_or_else(ended)?;
-            if place.sequence < next {
+            let Received { position, payload, .. } = received.unwrap_or_else(ended)?;
+            if position.sequence < next {
                 continue;
             }
             // Messages were removed behind a newer snapshot: what is missing can't be rebuilt.
-            if place.sequence > next {
-                return Err(LogError::Snapshot(missing(next, place.sequence - 1)).into());
+            if position.sequence > next {
+                return Err(LogError::Snapshot(missing(next, position.sequence - 1)).into());
             }
-            if matches!(until, Until::Time(end) if place.stored > end) {
+            if matches!(until, Until::Time(end) if position.stored > end) {
                 return Ok(None);
             }
             // Also a message that was applied before is shown, with its steps.
             let decoded = message::decode(&payload, &self.state.members).ok();
-            let applied = self.state.apply(place, &payload, |_| None)?;
+            let applied = self.state.apply(position, &payload, |_| None)?;
             let (fresh, outcomes, sealed) = match applied {
                 Applied::Fresh { outcomes, sealed, .. } => (true, outcomes, sealed),
                 Applied::Stale(_) | Applied::Ignored(_) => (false, Vec::new(), Vec::new()),
@@ -196,7 +196,7 @@ impl Reading {
             let (origin, mut steps) =
                 decoded.map(|message| (Some(message.origin), message.steps)).unwrap_or_default();
             steps.extend(sealed.into_iter().filter_map(|member| self.closed_gate(member)));
-            let Place { sequence, stored } = place;
+            let StreamPosition { sequence, stored } = position;
             return Ok(Some(Record { sequence, stored, origin, steps, refusals, fresh }));
         }
     }
@@ -223,7 +223,7 @@ async fn read_from(
     let mut state = State::new(members);
     store.load(snapshot, &mut state).await?;
     // Not a consumer: a message with malformed headers must not end it.
-    let messages = fetched(store, state.place.sequence + 1);
+    let messages = fetched(store, state.position.sequence + 1);
     Ok(Reading { state, messages })
 }
 
@@ -240,7 +240,7 @@ pub(super) async fn digest_at(
     let is_continued = |snapshot: &&Snapshot| snapshot.sequence + 1 >= info.state.first_sequence;
     let known = [pointer.previous.as_ref().filter(is_continued), Some(&pointer.newest)];
     let mut reading = read_from(store, known, members, until).await.map_err(End::reason)?;
-    while reading.state.place.sequence < sequence {
+    while reading.state.position.sequence < sequence {
         reading.next(until).await.map_err(End::reason)?;
     }
     Ok(digest_of(&reading.state.encode()))

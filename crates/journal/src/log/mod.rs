@@ -13,8 +13,8 @@
 //!
 //! In `parts`, `thread.rs` runs sessions, and `session.rs` joins the parts of a node (`node.rs`): `applier.rs`,
 //! `sender.rs`, `snapshotter.rs`, `comparer.rs`, `continuity.rs` for seals after a restart, and
-//! `wrong_contents.rs` for a node whose contents were wrong. `session_start.rs` is for the beginning of a session,
-//! and `applied_file.rs` for a node with a file. `stream/messages.rs` reads the stream.
+//! `rejoin.rs` for a node whose contents were wrong. `session_start.rs` is for the beginning of a session,
+//! and `note.rs` for a node with a file. `stream/messages.rs` reads the stream.
 
 mod clock;
 mod defaults;
@@ -47,11 +47,11 @@ pub use settings::{
     CONTACTS_PER_LAG, ClientIdentity, Login, Servers, Settings, Tls, check_name, check_node,
 };
 pub use shared::Checkpoint;
-pub use status::{Digest, Event, Node, Phase, Status};
+pub use status::{Digest, Event, NodeStatus, Phase, Status};
 pub use stream::message::Origin;
 
-use parts::applied_file::Note;
-use parts::node::Node as Running;
+use parts::node::Node;
+use parts::note::Note;
 use shared::Shared;
 
 /// The journal of memories that several nodes share.
@@ -126,7 +126,7 @@ impl Log {
         let members = self.members.iter().map(|(_, memory)| Arc::clone(memory)).collect();
         let fingerprint = layout::fingerprint(&self.members);
         let (settings, shared) = (Arc::clone(&self.settings), Arc::clone(&self.shared));
-        let mut node = Running::new(settings, fingerprint, shared, members);
+        let mut node = Node::new(settings, fingerprint, shared, members);
         if let Some(note) = note.take() {
             node.applier.resume(note)?;
         }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use holdfast_memory::{Memory, Step};
 
 use super::error::LogError;
-use super::state::{Place, State};
+use super::state::{State, StreamPosition};
 use super::stream::message::{self, Message};
 use crate::encoding;
 
@@ -22,8 +22,8 @@ impl Replica {
     /// # Errors
     /// [`LogError::Version`]
     pub fn apply(&mut self, payload: &[u8]) -> Result<(), LogError> {
-        let sequence = self.0.place.sequence + 1;
-        self.0.apply(Place { sequence, stored: 0 }, payload, |_| None).map(drop)
+        let sequence = self.0.position.sequence + 1;
+        self.0.apply(StreamPosition { sequence, stored: 0 }, payload, |_| None).map(drop)
     }
 
     /// What a snapshot has.
@@ -36,7 +36,7 @@ impl Replica {
     /// # Errors
     /// As those of a log.
     pub fn load(&mut self, snapshot: &[u8], sequence: u64) -> Result<(), LogError> {
-        self.0.load(snapshot, Place { sequence, stored: 0 })
+        self.0.load(snapshot, StreamPosition { sequence, stored: 0 })
     }
 }
 

@@ -13,7 +13,7 @@ use tokio::sync::Notify;
 use super::clock::{Clock, Moment};
 use super::error::LogError;
 use super::settings::Settings;
-use super::status::{Counters, Event, Node, Phase, View};
+use super::status::{Counters, Event, NodeStatus, Phase, View};
 use super::stream::message::STEP_LEN_BYTES;
 use crate::encoding;
 
@@ -73,12 +73,12 @@ enum Exchange {
 #[derive(Default)]
 struct Queue {
     is_open: bool,
-    steps: VecDeque<Waiting>,
+    steps: VecDeque<UnsentStep>,
     bytes: usize,
 }
 
 /// A step that was not sent yet.
-pub(super) struct Waiting {
+pub(super) struct UnsentStep {
     pub(super) bytes: Vec<u8>,
     pub(super) done: Done,
     pub(super) until: Instant,
@@ -117,7 +117,7 @@ impl Journal for Shared {
         }
         queue.bytes += bytes.len();
         let until = Instant::now() + self.write_timeout;
-        queue.steps.push_back(Waiting { bytes, done, until });
+        queue.steps.push_back(UnsentStep { bytes, done, until });
         drop(queue);
         self.step_arrived.notify_one();
     }
@@ -218,7 +218,7 @@ impl Shared {
     }
 
     /// Takes steps for one message: as many as `room` has bytes for, and at least one.
-    pub(super) fn take(&self, room: usize) -> Vec<Waiting> {
+    pub(super) fn take(&self, room: usize) -> Vec<UnsentStep> {
         let mut queue = lock(&self.queue);
         let (mut count, mut len) = (0, 0);
         for waiting in &queue.steps {
@@ -229,7 +229,7 @@ impl Shared {
             }
             count += 1;
         }
-        let taken: Vec<Waiting> = queue.steps.drain(..count).collect();
+        let taken: Vec<UnsentStep> = queue.steps.drain(..count).collect();
         queue.bytes -= taken.iter().map(|waiting| waiting.bytes.len()).sum::<usize>();
         taken
     }
@@ -337,7 +337,7 @@ impl Shared {
     }
 
     /// Changes what is known of a node. No call waits for that, so none is woken.
-    pub(super) fn update_node(&self, node: &str, change: impl FnOnce(&mut Node)) {
+    pub(super) fn update_node(&self, node: &str, change: impl FnOnce(&mut NodeStatus)) {
         let nodes = &mut lock(&self.progress).view.nodes;
         match nodes.get_mut(node) {
             Some(known) => change(known),

@@ -26,7 +26,7 @@ const MARK: [u8; 3] = *b"HFS";
 #[derive(Debug)]
 pub(super) struct State {
     pub(super) members: Vec<Arc<Memory>>,
-    pub(super) place: Place,
+    pub(super) position: StreamPosition,
     /// How many steps were applied since the log began.
     pub(super) steps: u64,
     /// The start and the last counter that were applied of each node.
@@ -36,14 +36,14 @@ pub(super) struct State {
 
 /// A message of the stream.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Place {
+pub(super) struct StreamPosition {
     /// 0 before the first message.
     pub(super) sequence: u64,
     /// When the stream has stored it, in nanoseconds of Unix time.
     pub(super) stored: i64,
 }
 
-impl fmt::Display for Place {
+impl fmt::Display for StreamPosition {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         // Seconds suffice for people.
         let stored = OffsetDateTime::from_unix_timestamp(self.stored.div_euclid(1_000_000_000));
@@ -74,7 +74,7 @@ impl State {
     pub(super) fn new(members: Vec<Arc<Memory>>) -> State {
         State {
             members,
-            place: Place::default(),
+            position: StreamPosition::default(),
             steps: 0,
             origins: BTreeMap::new(),
             terms: LeaseTerms::default(),
@@ -119,11 +119,15 @@ impl State {
     /// [`LogError::Version`]: this node can't know what the message does.
     pub(super) fn apply(
         &mut self,
-        place: Place,
+        position: StreamPosition,
         payload: &[u8],
         age: impl FnOnce(&Origin) -> Option<Duration>,
     ) -> Result<Applied, LogError> {
-        debug_assert_eq!(place.sequence, self.place.sequence + 1, "messages are applied in order");
+        debug_assert_eq!(
+            position.sequence,
+            self.position.sequence + 1,
+            "messages are applied in order"
+        );
         let Message { origin, compares, deadline, notice, steps } =
             match message::decode(payload, &self.members) {
                 Ok(message) => message,
@@ -133,11 +137,11 @@ impl State {
                 }
                 // It has a place in the order all the same: all nodes ignore it there.
                 Err(error) => {
-                    self.place = place;
+                    self.position = position;
                     return Ok(Applied::Ignored(error));
                 }
             };
-        self.place = place;
+        self.position = position;
         // A message that was sent again, or one that a later start of its node has overtaken.
         let now = (origin.start, origin.counter);
         if self.origins.get(&origin.node).is_some_and(|last| *last >= now) {
@@ -149,9 +153,9 @@ impl State {
         }
         self.origins.insert(origin.node.clone(), now);
         self.steps += steps.len() as u64;
-        let at = |done| CarriedOut { sequence: Some(place.sequence), ..done };
+        let at = |done| CarriedOut { sequence: Some(position.sequence), ..done };
         let age = age(&origin);
-        let is_late = is_late(place.stored, deadline);
+        let is_late = is_late(position.stored, deadline);
         let carried_out = |step: &Step| {
             self.terms.admit(step.tenure)?;
             if is_late {
@@ -162,7 +166,7 @@ impl State {
         let outcomes = steps.iter().map(carried_out).collect();
         let sealed = match notice {
             // What came between may be an answer, or seals that were closed and opened again.
-            Some(Notice::Closes { behind }) if behind.checked_add(1) == Some(place.sequence) => {
+            Some(Notice::Closes { behind }) if behind.checked_add(1) == Some(position.sequence) => {
                 self.close_seals()
             }
             _ => Vec::new(),
@@ -195,8 +199,8 @@ impl State {
             Vec::with_capacity(len + 64 + self.origins.len() * 96 + self.terms.len() * 24);
         out.extend_from_slice(&MARK);
         out.push(self.version());
-        out.extend_from_slice(&self.place.sequence.to_le_bytes());
-        out.extend_from_slice(&self.place.stored.to_le_bytes());
+        out.extend_from_slice(&self.position.sequence.to_le_bytes());
+        out.extend_from_slice(&self.position.stored.to_le_bytes());
         out.extend_from_slice(&self.steps.to_le_bytes());
         out.extend_from_slice(&(self.origins.len() as u32).to_le_bytes());
         for (node, (start, counter)) in &self.origins {
@@ -223,7 +227,7 @@ impl State {
     ///
     /// # Errors
     /// [`LogError::Version`], or [`LogError::Snapshot`]. Nothing has changed then.
-    pub(super) fn load(&mut self, bytes: &[u8], expected: Place) -> Result<(), LogError> {
+    pub(super) fn load(&mut self, bytes: &[u8], expected: StreamPosition) -> Result<(), LogError> {
         let malformed = || LogError::Snapshot("the snapshot of the log is malformed".to_owned());
         let bytes = bytes.strip_prefix(&MARK).ok_or_else(malformed)?;
         let (&found, mut rest) = bytes.split_first().ok_or_else(malformed)?;
@@ -232,8 +236,8 @@ impl State {
             return Err(LogError::Version { what, found, supported: WITH_LEASES });
         }
         let loaded = loaded(&mut rest, found, &self.members).filter(|_| rest.is_empty());
-        let Loaded { place, steps, origins, terms, contents } = loaded.ok_or_else(malformed)?;
-        if place != expected {
+        let Loaded { position, steps, origins, terms, contents } = loaded.ok_or_else(malformed)?;
+        if position != expected {
             let sequence = expected.sequence;
             let text = format!("the snapshot at sequence {sequence}: it has another sequence");
             return Err(LogError::Snapshot(text));
@@ -241,7 +245,7 @@ impl State {
         for (memory, contents) in self.members.iter().zip(&contents) {
             memory.restore(contents);
         }
-        (self.place, self.steps) = (place, steps);
+        (self.position, self.steps) = (position, steps);
         (self.origins, self.terms) = (origins, terms);
         Ok(())
     }
@@ -254,7 +258,7 @@ pub(super) fn digest_of(encoded: &[u8]) -> String {
 }
 
 struct Loaded {
-    place: Place,
+    position: StreamPosition,
     steps: u64,
     origins: BTreeMap<String, (u64, u64)>,
     terms: LeaseTerms,
@@ -264,7 +268,7 @@ struct Loaded {
 /// Takes an encoded state for these memories.
 fn loaded(bytes: &mut &[u8], version: u8, members: &[Arc<Memory>]) -> Option<Loaded> {
     let sequence = bytes.try_get_u64_le().ok()?;
-    let place = Place { sequence, stored: bytes.try_get_i64_le().ok()? };
+    let position = StreamPosition { sequence, stored: bytes.try_get_i64_le().ok()? };
     let steps = bytes.try_get_u64_le().ok()?;
     let mut origins = BTreeMap::new();
     for _ in 0..bytes.try_get_u32_le().ok()? {
@@ -279,7 +283,7 @@ fn loaded(bytes: &mut &[u8], version: u8, members: &[Arc<Memory>]) -> Option<Loa
         return None;
     }
     let contents = members.iter().map(|memory| contents(bytes, memory)).collect::<Option<_>>()?;
-    Some(Loaded { place, steps, origins, terms, contents })
+    Some(Loaded { position, steps, origins, terms, contents })
 }
 
 /// Takes the contents of a memory.
@@ -317,14 +321,14 @@ mod tests {
         let mut contents = Memory::contents(std::slice::from_ref(&from)).remove(0);
         contents.areas[0][0] = 1;
         from.restore(&contents);
-        let place = Place { sequence: 7, stored: 1 };
-        let saved = State { place, ..State::new(vec![from]) }.encode();
+        let position = StreamPosition { sequence: 7, stored: 1 };
+        let saved = State { position, ..State::new(vec![from]) }.encode();
         let mut state = State::new(vec![into]);
         let before = state.encode();
-        let error = state.load(&saved, Place { sequence: 8, stored: 1 }).unwrap_err();
+        let error = state.load(&saved, StreamPosition { sequence: 8, stored: 1 }).unwrap_err();
         assert!(error.to_string().contains("sequence 8: it has another sequence"));
         assert_eq!(state.encode(), before);
-        state.load(&saved, place).unwrap();
+        state.load(&saved, position).unwrap();
         assert_eq!(state.encode(), saved);
     }
 
@@ -339,7 +343,7 @@ mod tests {
         let saved = state.encode();
         assert_eq!(saved[3], WITH_LEASES);
         let mut loaded = State::new(vec![member()]);
-        loaded.load(&saved, state.place).unwrap();
+        loaded.load(&saved, state.position).unwrap();
         assert_eq!((loaded.encode(), &loaded.terms), (saved, &state.terms));
         assert!(
             loaded.terms.admit(tenure(1, 4)).is_err() && loaded.terms.admit(tenure(0, 9)).is_err()
@@ -361,8 +365,9 @@ mod tests {
             encoding::encode(&Step { access: Access::Client, tenure: None, action }, &mut step);
             let origin = Origin { node: "a".to_owned(), start: 1, counter: sequence };
             let payload = message::encode(&origin, false, deadline, [&step[..]].into_iter());
-            let place = Place { sequence, stored };
-            let Applied::Fresh { outcomes, .. } = state.apply(place, &payload, |_| None).unwrap()
+            let position = StreamPosition { sequence, stored };
+            let Applied::Fresh { outcomes, .. } =
+                state.apply(position, &payload, |_| None).unwrap()
             else {
                 panic!("it is fresh");
             };
@@ -389,8 +394,8 @@ mod tests {
         let mut apply = |sequence, notice| {
             let origin = Origin { node: "a".to_owned(), start: 1, counter: sequence };
             let payload = message::encode_notice(&origin, false, notice);
-            let place = Place { sequence, stored: 0 };
-            let Applied::Fresh { sealed, .. } = state.apply(place, &payload, |_| None).unwrap()
+            let position = StreamPosition { sequence, stored: 0 };
+            let Applied::Fresh { sealed, .. } = state.apply(position, &payload, |_| None).unwrap()
             else {
                 panic!("it is fresh");
             };
@@ -409,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn a_place_is_shown_with_its_time() {
+    fn a_position_is_shown_with_its_time() {
         for (seconds, expected) in [
             (0, "1970-01-01T00:00:00Z"),
             (951_827_696, "2000-02-29T12:34:56Z"),
@@ -417,8 +422,8 @@ mod tests {
             (4_107_542_400, "2100-03-01T00:00:00Z"),
             (-1, "1969-12-31T23:59:59Z"),
         ] {
-            let place = Place { sequence: 7, stored: seconds * 1_000_000_000 };
-            assert_eq!(place.to_string(), format!("sequence 7 ({expected})"));
+            let position = StreamPosition { sequence: 7, stored: seconds * 1_000_000_000 };
+            assert_eq!(position.to_string(), format!("sequence 7 ({expected})"));
         }
     }
 }

@@ -45,7 +45,7 @@ pub(super) struct View {
     pub(super) replicas: usize,
     pub(super) digest: Option<Digest>,
     pub(super) snapshot: Option<u64>,
-    pub(super) nodes: BTreeMap<String, Node>,
+    pub(super) nodes: BTreeMap<String, NodeStatus>,
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -58,7 +58,7 @@ pub struct Digest {
 
 /// What is known of a node of the log.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Node {
+pub struct NodeStatus {
     /// The sequence of its last message.
     pub sequence: u64,
     /// When the stream stored that, in nanoseconds of Unix time.
@@ -98,7 +98,7 @@ pub struct Status {
     pub digest: Option<Digest>,
     /// The sequence of the newest snapshot.
     pub snapshot: Option<u64>,
-    pub nodes: BTreeMap<String, Node>,
+    pub nodes: BTreeMap<String, NodeStatus>,
 }
 
 /// Something that happened, for the log of the program.

@@ -6,11 +6,11 @@ use holdfast_memory::Memory;
 
 use crate::log::clock::Moment;
 use crate::log::error::{End, LogError};
-use crate::log::parts::applied_file::Note;
+use crate::log::parts::note::Note;
 use crate::log::settings::Settings;
 use crate::log::shared::{Checkpoint, Shared};
-use crate::log::state::{Applied, Place, State};
-use crate::log::status::{Event, Node};
+use crate::log::state::{Applied, State, StreamPosition};
+use crate::log::status::{Event, NodeStatus};
 use crate::log::stream::message::Origin;
 use crate::log::stream::raw_message::Received;
 
@@ -40,7 +40,7 @@ impl Applier {
     /// [`LogError::Snapshot`] if they are not those of the note.
     pub(in crate::log) fn resume(&mut self, note: Note) -> Result<(), LogError> {
         note.restore(&mut self.state)?;
-        self.shared.counters.sequence.set(self.state.place.sequence);
+        self.shared.counters.sequence.set(self.state.position.sequence);
         self.stream_id = Some(note.stream);
         Ok(())
     }
@@ -50,7 +50,7 @@ impl Applier {
     }
 
     pub(in crate::log) fn sequence(&self) -> u64 {
-        self.state.place.sequence
+        self.state.position.sequence
     }
 
     pub(in crate::log) fn stream_id(&self) -> Option<&str> {
@@ -70,48 +70,48 @@ impl Applier {
         received: &Received,
         first_sent: impl FnOnce(&Origin) -> Option<Moment>,
     ) -> Result<Option<Applied>, End> {
-        let place = received.place;
+        let position = received.position;
         self.shared.counters.last_sequence.set(received.last);
-        let applied = self.state.place;
+        let applied = self.state.position;
         // A session reads the last message again. If the servers were set back and have taken other
         // messages since, it has another time.
-        if place.sequence == applied.sequence && place != applied {
+        if position.sequence == applied.sequence && position != applied {
             let text = format!(
-                "the message at {place} is not the one that this node has applied, {applied}: the \
+                "the message at {position} is not the one that this node has applied, {applied}: the \
                  servers have lost messages"
             );
             return Err(self.replaced(text).into());
         }
-        if place.sequence <= applied.sequence {
+        if position.sequence <= applied.sequence {
             return Ok(None);
         }
-        if place.sequence != applied.sequence + 1 {
-            return Err(End::missing(applied.sequence + 1, place.sequence - 1));
+        if position.sequence != applied.sequence + 1 {
+            return Err(End::missing(applied.sequence + 1, position.sequence - 1));
         }
-        self.apply(place, &received.payload, first_sent).map(Some)
+        self.apply(position, &received.payload, first_sent).map(Some)
     }
 
     fn apply(
         &mut self,
-        place: Place,
+        position: StreamPosition,
         payload: &[u8],
         first_sent: impl FnOnce(&Origin) -> Option<Moment>,
     ) -> Result<Applied, End> {
         let shared = &self.shared;
         let age = |origin: &Origin| shared.age_since(first_sent(origin));
-        let applied = self.state.apply(place, payload, age)?;
-        shared.counters.sequence.set(place.sequence);
+        let applied = self.state.apply(position, payload, age)?;
+        shared.counters.sequence.set(position.sequence);
         match &applied {
             Applied::Fresh { origin, .. } => {
-                shared.update_node(&origin.node, |node: &mut Node| {
-                    node.sequence = place.sequence;
-                    node.stored = place.stored;
+                shared.update_node(&origin.node, |node: &mut NodeStatus| {
+                    node.sequence = position.sequence;
+                    node.stored = position.stored;
                 });
             }
             Applied::Stale(_) => shared.counters.stale.add(),
             Applied::Ignored(error) => {
                 shared.counters.ignored.add();
-                let sequence = place.sequence.to_string();
+                let sequence = position.sequence.to_string();
                 let fields = [("sequence", sequence.as_str()), ("reason", &error.to_string())];
                 shared.event(Event::new("log_message_ignored", &fields));
             }
@@ -133,7 +133,7 @@ impl Applier {
             self.state.members = state.members;
         }
         self.shared.set_loading(false);
-        self.shared.counters.sequence.set(self.state.place.sequence);
+        self.shared.counters.sequence.set(self.state.position.sequence);
     }
 
     /// While a snapshot is loaded, there are none.
@@ -150,9 +150,9 @@ impl Applier {
     /// The servers do not have what this node has applied. Says what to do.
     pub(in crate::log) fn replaced(&self, text: String) -> LogError {
         let Some(file) = &self.settings.memory_file else { return LogError::Replaced(text) };
-        let place = self.state.place;
+        let position = self.state.position;
         LogError::Replaced(format!(
-            "{text}. The contents of this node at {place} are kept in {file}. Stop all nodes and \
+            "{text}. The contents of this node at {position} are kept in {file}. Stop all nodes and \
              decide which contents are right. Those of this node: 'holdfast memory export', then a \
              new log, under another name, with these values as 'initial'. Those of the log: go on \
              with it. In both cases move {file} away afterwards"

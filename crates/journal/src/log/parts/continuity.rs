@@ -76,7 +76,7 @@ impl Continuity {
     /// The question of this node was applied, behind all that the log had.
     pub(in crate::log) fn joined(&mut self, state: &State, now: Instant) {
         let Stage::Started { left } = self.stage else { return };
-        let sequence = state.place.sequence;
+        let sequence = state.position.sequence;
         // The contents of a new log are as they are configured.
         self.stage = if sequence == 1 || !state.has_open_seal() {
             Stage::Known
@@ -98,7 +98,7 @@ impl Continuity {
     ) {
         match notice {
             // This node may know only later, and nodes ask seldom.
-            Some(Notice::Asks) if own.is_none() => self.asked = Some(state.place.sequence),
+            Some(Notice::Asks) if own.is_none() => self.asked = Some(state.position.sequence),
             Some(Notice::Answers { sequence }) if self.asked <= Some(sequence) => self.asked = None,
             _ => {}
         }
@@ -157,7 +157,7 @@ mod tests {
     use holdfast_memory::{Access, Area, Gate, Layout, Span, Write};
 
     use super::*;
-    use crate::log::state::Place;
+    use crate::log::state::StreamPosition;
 
     /// The state of a node `a` at this sequence, with an open seal, and what it knows.
     fn asking(sequence: u64) -> (State, Continuity, Instant) {
@@ -169,8 +169,8 @@ mod tests {
         let settings = Arc::new(Settings::new("site", "a", Vec::new()));
         let mut continuity = Continuity::new(&settings, &members);
         let origins = BTreeMap::from(["a", "b"].map(|node| (node.to_owned(), (1, 1))));
-        let place = Place { sequence, stored: 0 };
-        let state = State { place, origins, ..State::new(members) };
+        let position = StreamPosition { sequence, stored: 0 };
+        let state = State { position, origins, ..State::new(members) };
         let now = Instant::now();
         continuity.joined(&state, now);
         continuity.applied(&state, "a", Some(Notice::Asks), Some(1), now);
@@ -181,7 +181,7 @@ mod tests {
     fn an_answer_to_an_earlier_question_proves_nothing() {
         let (mut state, mut continuity, now) = asking(7);
         let mut answered = |sequence| {
-            state.place.sequence += 1;
+            state.position.sequence += 1;
             continuity.applied(&state, "b", Some(Notice::Answers { sequence }), None, now);
             continuity.is_known()
         };
@@ -200,11 +200,11 @@ mod tests {
         continuity.closing(2, late);
         assert_eq!(continuity.due(7, late), None, "it is under way");
         // Another node asks first.
-        state.place.sequence = 8;
+        state.position.sequence = 8;
         continuity.applied(&state, "b", Some(Notice::Asks), None, late);
         assert_eq!(continuity.take_answer(), None, "it does not know either");
         assert_eq!(continuity.due(8, late), None);
-        state.place.sequence = 9;
+        state.position.sequence = 9;
         continuity.applied(&state, "a", Some(Notice::Closes { behind: 7 }), Some(2), late);
         assert_eq!(continuity.due(9, late), Some(Notice::Closes { behind: 9 }));
         continuity.closing(3, late);
@@ -241,7 +241,7 @@ mod tests {
     fn a_node_that_knows_answers_the_last_question_of_others() {
         let (mut state, mut continuity, now) = asking(7);
         let mut applied = |continuity: &mut Continuity, sequence, notice, own: Option<u64>| {
-            state.place.sequence = sequence;
+            state.position.sequence = sequence;
             let node = if own.is_some() { "a" } else { "b" };
             continuity.applied(&state, node, Some(notice), own, now);
         };

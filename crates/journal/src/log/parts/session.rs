@@ -19,7 +19,7 @@ use crate::log::parts::background::{Background, Report};
 use crate::log::parts::comparer::Replayed;
 use crate::log::parts::node::{CHECK_INTERVAL, Node};
 use crate::log::parts::sender::{Acknowledged, Publisher};
-use crate::log::parts::session_start::{join, lags};
+use crate::log::parts::session_start::{join, servers_behind};
 use crate::log::settings::Settings;
 use crate::log::state::{Applied, digest_of};
 use crate::log::status::{Event, Phase};
@@ -250,7 +250,7 @@ impl<'n> Session<'n> {
         match applied {
             Applied::Fresh { origin, compares: is_asked, notice, outcomes, .. } => {
                 compares = is_asked;
-                let stored = received.place.stored;
+                let stored = received.position.stored;
                 let own = self.node.sender.applied(&origin, stored, outcomes)?;
                 if let Some(counter) = own {
                     is_for_snapshot = self.node.snapshotter.is_requested_at(counter);
@@ -265,7 +265,7 @@ impl<'n> Session<'n> {
             Applied::Ignored(MessageError::TooManyNodes) => check_room(self.node)?,
             Applied::Ignored(_) => {}
         }
-        let sequence = received.place.sequence;
+        let sequence = received.position.sequence;
         if compares || self.node.comparer.is_due(sequence) {
             self.compare(sequence, is_for_snapshot)?;
         }
@@ -512,7 +512,7 @@ async fn open_store(node: &mut Node, client: &Client) -> Result<Store, End> {
     let is_known = node.applier.stream_id().is_some();
     if is_known && node.run_with_expiry(Store::is_missing(&context, &settings)).await?? {
         let text = "the servers do not have the stream of the log any more: they have lost it";
-        return Err(lags(node, text.to_owned()));
+        return Err(servers_behind(node, text.to_owned()));
     }
     node.run_with_expiry(Store::open(&context, &settings, &fingerprint, OpenAs::Node)).await?
 }

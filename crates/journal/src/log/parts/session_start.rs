@@ -4,7 +4,7 @@
 use crate::log::error::{End, LogError};
 use crate::log::parts::node::Node;
 use crate::log::shared::Shared;
-use crate::log::state::{Place, State, digest_of};
+use crate::log::state::{State, StreamPosition, digest_of};
 use crate::log::status::Event;
 use crate::log::stream::store::{Pointer, Snapshot, Store};
 
@@ -19,20 +19,20 @@ pub(in crate::log) async fn join(node: &mut Node, store: &Store) -> Result<u64, 
     let (first, end) = {
         let info = &store.stream.cached_info().state;
         let stored = info.last_timestamp.unix_timestamp_nanos() as i64;
-        (info.first_sequence, Place { sequence: info.last_sequence, stored })
+        (info.first_sequence, StreamPosition { sequence: info.last_sequence, stored })
     };
-    let place = node.applier.state().place;
-    if end.sequence < place.sequence {
-        return Err(lags(
+    let position = node.applier.state().position;
+    if end.sequence < position.sequence {
+        return Err(servers_behind(
             node,
             format!(
-                "the stream ends at {end}, but this node has applied {place}: the servers have lost \
+                "the stream ends at {end}, but this node has applied {position}: the servers have lost \
                  messages"
             ),
         ));
     }
     // The next message was removed behind a snapshot: this node was away for too long.
-    let is_gone = first > place.sequence + 1;
+    let is_gone = first > position.sequence + 1;
     if !is_known || is_gone || node.rejoin.needs_snapshot() {
         load(node, store, first, end.sequence).await?;
         node.rejoin.reloaded();
@@ -44,7 +44,7 @@ pub(in crate::log) async fn join(node: &mut Node, store: &Store) -> Result<u64, 
 }
 
 /// The servers know less than this node.
-pub(in crate::log) fn lags(node: &mut Node, text: String) -> End {
+pub(in crate::log) fn servers_behind(node: &mut Node, text: String) -> End {
     let error = node.applier.replaced(text);
     node.lost_messages.judge(error)
 }
@@ -56,7 +56,7 @@ async fn load(node: &mut Node, store: &Store, first: u64, last: u64) -> Result<(
         if last > 0 {
             let text = "the log has messages, but the key of its snapshot is missing: it was deleted, or a \
                         restore was cut short";
-            return Err(match lags(node, text.to_owned()) {
+            return Err(match servers_behind(node, text.to_owned()) {
                 // The contents of this node need not differ from those of the log.
                 End::Fatal(_) => LogError::Snapshot(text.to_owned()).into(),
                 other => other,
@@ -66,7 +66,7 @@ async fn load(node: &mut Node, store: &Store, first: u64, last: u64) -> Result<(
     };
     if pointer.newest.sequence > last {
         let sequence = pointer.newest.sequence;
-        return Err(lags(
+        return Err(servers_behind(
             node,
             format!(
                 "the stream ends at sequence {last}, but there is a snapshot at {sequence}: the \

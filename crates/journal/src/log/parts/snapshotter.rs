@@ -151,7 +151,7 @@ impl Snapshotter {
         steps >= self.settings.snapshot_steps
             || self.bytes >= self.settings.snapshot_bytes
                 && self.bytes >= SNAPSHOT_CONTENTS * state.contents_bytes()
-            || is_old && state.place.sequence > pointer.newest.sequence
+            || is_old && state.position.sequence > pointer.newest.sequence
     }
 
     /// The servers have no room for further messages. Removes those that the newest snapshot replaces, once

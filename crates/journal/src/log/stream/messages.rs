@@ -13,7 +13,7 @@ use futures_util::stream::{self, BoxStream};
 use futures_util::{FutureExt, StreamExt};
 
 use crate::log::error::End;
-use crate::log::state::Place;
+use crate::log::state::StreamPosition;
 use crate::log::stream::raw_message::Received;
 use crate::log::stream::store::Store;
 
@@ -86,9 +86,9 @@ impl Messages {
 fn delivered(message: &async_nats::jetstream::Message) -> Result<Received, End> {
     let info = message.info().map_err(|error| End::lost("a message of the stream", error))?;
     let stored = info.published.unix_timestamp_nanos() as i64;
-    let place = Place { sequence: info.stream_sequence, stored };
-    let (payload, last) = (message.payload.clone(), place.sequence + info.pending);
-    Ok(Received { place, payload, last, is_readable: true })
+    let position = StreamPosition { sequence: info.stream_sequence, stored };
+    let (payload, last) = (message.payload.clone(), position.sequence + info.pending);
+    Ok(Received { position, payload, last, is_readable: true })
 }
 
 /// Fetches messages from this sequence on. After the last one, waits for further ones.

@@ -9,14 +9,14 @@ use serde::Deserialize;
 use serde_json::Value;
 
 use crate::log::error::End;
-use crate::log::state::Place;
+use crate::log::state::StreamPosition;
 
 /// The beginning of headers without a status, `NATS/1.0` and a carriage return, in base64.
 const WITHOUT_STATUS: &str = "TkFUUy8xLjAN";
 
 #[derive(Debug)]
 pub(in crate::log) struct Received {
-    pub(in crate::log) place: Place,
+    pub(in crate::log) position: StreamPosition,
     pub(in crate::log) payload: Bytes,
     /// The last sequence of the stream, as far as it is known.
     pub(in crate::log) last: u64,
@@ -57,7 +57,7 @@ impl Received {
             && !message.subject.contains(breaks)
             && StreamMessage::try_from(message).is_ok();
         let StreamMessage { sequence, payload, time, .. } = without_headers.try_into()?;
-        let place = Place { sequence, stored: time.unix_timestamp_nanos() as i64 };
-        Ok(Received { place, payload, last: sequence, is_readable })
+        let position = StreamPosition { sequence, stored: time.unix_timestamp_nanos() as i64 };
+        Ok(Received { position, payload, last: sequence, is_readable })
     }
 }

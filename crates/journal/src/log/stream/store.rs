@@ -21,7 +21,7 @@ use tokio::io::AsyncReadExt;
 use crate::log::error::{End, LogError};
 use crate::log::layout::difference;
 use crate::log::settings::Settings;
-use crate::log::state::{Place, State, digest_of};
+use crate::log::state::{State, StreamPosition, digest_of};
 use crate::log::stream::message::{FIRST_VERSION, MAX_NODES, VERSION};
 use crate::log::stream::raw_message::{Received, fetch};
 
@@ -92,8 +92,8 @@ impl Snapshot {
     /// A snapshot of this state, which is not stored yet.
     pub(in crate::log) fn of(state: &State, digest: String, node: &str) -> Snapshot {
         Snapshot {
-            sequence: state.place.sequence,
-            stored: state.place.stored,
+            sequence: state.position.sequence,
+            stored: state.position.stored,
             steps: state.steps,
             object: format!("{:016x}", unique() as u64),
             digest,
@@ -236,7 +236,7 @@ impl Store {
         match fetch(&self.context, &self.keys.stream_name, which).await? {
             // A deleted key is empty.
             Some(entry) if !entry.payload.is_empty() => {
-                Ok(Some((entry.place.sequence, parsed(&entry.payload)?)))
+                Ok(Some((entry.position.sequence, parsed(&entry.payload)?)))
             }
             _ => Ok(None),
         }
@@ -258,7 +258,7 @@ impl Store {
             pointer.newest.sequence + 1 >= self.stream.cached_info().state.first_sequence;
         if is_continued && !entry.as_ref().is_some_and(is_there) {
             let value = serde_json::to_vec(pointer).map_err(|error| lost(&error))?;
-            let revision = entry.map_or(0, |entry| entry.place.sequence);
+            let revision = entry.map_or(0, |entry| entry.position.sequence);
             // Fails if another node does it at the same time.
             let updated = self.keys.update(SNAPSHOT_KEY, value.into(), revision).await;
             updated.map_err(|error| lost(&error))?;
@@ -269,7 +269,7 @@ impl Store {
         loop {
             let which = json!({"seq": from, "next_by_subj": digests});
             let Some(entry) = fetch(&self.context, stream, which).await? else { break };
-            (from, seen) = (entry.place.sequence + 1, seen + 1);
+            (from, seen) = (entry.position.sequence + 1, seen + 1);
             if !entry.is_readable || seen > MAX_NODES {
                 let purged = self.keys.stream.purge().filter(digests).await;
                 purged.map_err(|error| lost(&error))?;
@@ -286,8 +286,8 @@ impl Store {
         snapshot: &Snapshot,
         state: &mut State,
     ) -> Result<(), End> {
-        let place = Place { sequence: snapshot.sequence, stored: snapshot.stored };
-        Ok(state.load(&self.read(snapshot).await?, place)?)
+        let position = StreamPosition { sequence: snapshot.sequence, stored: snapshot.stored };
+        Ok(state.load(&self.read(snapshot).await?, position)?)
     }
 
     /// The bytes of a snapshot, if they have its digest.

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::log::error::LogError;
 use crate::log::shared::Checkpoint;
-use crate::log::state::{Place, State, digest_of};
+use crate::log::state::{State, StreamPosition, digest_of};
 use crate::log::stream::message::{FIRST_VERSION, WITH_LEASES};
 
 /// Which message of which log contents come from, and what a node has to know to go on from there.
@@ -53,8 +53,8 @@ impl Note {
             version: state.version(),
             log: log.to_owned(),
             stream: stream.to_owned(),
-            sequence: state.place.sequence,
-            stored: state.place.stored,
+            sequence: state.position.sequence,
+            stored: state.position.stored,
             steps: state.steps,
             origins: state.origins.clone(),
             terms: numbers.collect(),
@@ -76,7 +76,7 @@ impl Note {
                 memory.restore(&Contents { areas, sealed });
             }
         }
-        state.place = Place { sequence: self.sequence, stored: self.stored };
+        state.position = StreamPosition { sequence: self.sequence, stored: self.stored };
         state.steps = self.steps;
         state.origins = self.origins.clone();
         let terms = self.terms.iter();
@@ -86,9 +86,9 @@ impl Note {
         if found == self.digest {
             return Ok(());
         }
-        let (place, expected) = (state.place, &self.digest);
+        let (position, expected) = (state.position, &self.digest);
         Err(LogError::Snapshot(format!(
-            "the contents of {place} have digest {found}, expected is {expected}: something else has \
+            "the contents of {position} have digest {found}, expected is {expected}: something else has \
              changed the file. Move it away to start with the contents of the log"
         )))
     }
