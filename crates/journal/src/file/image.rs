@@ -46,8 +46,16 @@ pub(super) struct Changes {
     pub pages: Vec<Page>,
     /// The names and numbers of what the file does not contain any more.
     pub removed: Vec<(String, u16)>,
-    /// Another note of the log, or none any more.
-    pub note: Option<Option<Vec<u8>>>,
+    pub note: NoteChange,
+}
+
+/// What becomes of the note of the log.
+#[derive(Debug, Default)]
+pub(super) enum NoteChange {
+    #[default]
+    Keep,
+    Set(Vec<u8>),
+    Remove,
 }
 
 impl Changes {
@@ -55,7 +63,7 @@ impl Changes {
         self.memories.is_empty()
             && self.pages.is_empty()
             && self.removed.is_empty()
-            && self.note.is_none()
+            && matches!(self.note, NoteChange::Keep)
     }
 }
 
@@ -131,8 +139,10 @@ impl Image {
 
     pub fn apply(&mut self, changes: Changes) {
         self.memories.retain(|stored| changes.removed.iter().all(|(name, _)| *name != stored.name));
-        if let Some(note) = changes.note {
-            self.note = note;
+        match changes.note {
+            NoteChange::Keep => {}
+            NoteChange::Set(note) => self.note = Some(note),
+            NoteChange::Remove => self.note = None,
         }
         for new in changes.memories {
             match self.memories.iter_mut().find(|stored| stored.id == new.id) {

@@ -15,7 +15,7 @@ use holdfast_runtime::lock;
 use super::before_reply::BeforeReply;
 use super::disk::Disk;
 use super::error::FileError;
-use super::image::{Changes, Image, StoredMemory};
+use super::image::{Changes, Image, NoteChange, StoredMemory};
 use super::periodic::{CheckpointSource, Periodic, writes};
 use super::queue::{Queue, QueueLimits};
 use super::shrunk_memory::SET_ASIDE;
@@ -219,14 +219,16 @@ impl MemoryFile {
             };
             let mut changes;
             (changes, ids) = first_changes(store.image(), &self.members, contents)?;
-            changes.note = (store.image().note != note).then_some(note);
+            if store.image().note != note {
+                changes.note = note.map_or(NoteChange::Remove, NoteChange::Set);
+            }
             store.store(changes)
         })?;
         let State::Loaded(store) = mem::replace(&mut *state, State::Stopped) else {
             unreachable!("the state is locked")
         };
         let (queue, retry) = (Arc::clone(&self.queue), self.options.retry);
-        let keeping: Box<dyn FnOnce() -> Result<(), FileError> + Send> =
+        let store_loop: Box<dyn FnOnce() -> Result<(), FileError> + Send> =
             if self.options.stores_before_reply() {
                 let before_reply = BeforeReply::new(*store, memories, ids, queue, retry);
                 Box::new(|| before_reply.run())
@@ -238,7 +240,7 @@ impl MemoryFile {
             };
         let (queue, status) = (Arc::clone(&self.queue), Arc::clone(&self.status));
         let thread = thread::Builder::new().name("memory file".to_owned()).spawn(move || {
-            let ended = catch_unwind(AssertUnwindSafe(keeping)).unwrap_or_else(|_| {
+            let ended = catch_unwind(AssertUnwindSafe(store_loop)).unwrap_or_else(|_| {
                 let error = FileError::Io(io::Error::other("the thread that stores has panicked"));
                 let mut status = lock(&status);
                 (status.failing, status.busy_since) = (Some(error.to_string()), None);
@@ -376,8 +378,11 @@ fn first_changes(
         }
         if let Some(stored) = stored {
             let set_aside = image.set_aside_of(name);
-            match stored.cut(set_aside, layout, 0) {
-                Some(cut) => changes.memories.push(StoredMemory { id: id_of(set_aside)?, ..cut }),
+            match stored.cut(set_aside, layout) {
+                Some((layout, areas)) => {
+                    let (name, id) = (format!("{name}{SET_ASIDE}"), id_of(set_aside)?);
+                    changes.memories.push(StoredMemory { name, id, layout, areas });
+                }
                 None => changes.removed.extend(set_aside.map(|old| (old.name.clone(), old.id))),
             }
         }

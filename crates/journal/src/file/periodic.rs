@@ -8,7 +8,7 @@ use std::time::Duration;
 use holdfast_memory::{Contents, Memory};
 
 use super::error::FileError;
-use super::image::Changes;
+use super::image::{Changes, NoteChange};
 use super::queue::{Next, Queue};
 use super::store::Store;
 
@@ -51,9 +51,9 @@ impl Periodic {
             return self.store.store(Changes::default());
         }
         let (contents, note) = match &self.log {
-            None => (Memory::contents(&self.memories), None),
+            None => (Memory::contents(&self.memories), NoteChange::Keep),
             Some(log) => match log.checkpoint() {
-                Some((contents, note)) => (contents, Some(Some(note))),
+                Some((contents, note)) => (contents, NoteChange::Set(note)),
                 // What the file has stays the last that was right.
                 None => return Ok(()),
             },

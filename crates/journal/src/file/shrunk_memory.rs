@@ -32,14 +32,13 @@ impl StoredMemory {
         StoredMemory { name: self.name.clone(), id: self.id, layout, areas }
     }
 
-    /// What is set aside when the memory has another layout; `None` if that lacks nothing. Addresses
-    /// that it has are 0 in between.
+    /// The layout and contents of what is set aside when the memory has another layout; `None` if that lacks
+    /// nothing. Addresses that it has are 0 in between.
     pub(super) fn cut(
         &self,
         set_aside: Option<&StoredMemory>,
         other: &Layout,
-        id: u16,
-    ) -> Option<StoredMemory> {
+    ) -> Option<(Layout, Vec<Box<[u8]>>)> {
         let mut layout = Layout::default();
         for area in self.known(set_aside) {
             layout = layout.with(area, self.lacking(set_aside, other, area));
@@ -49,7 +48,7 @@ impl StoredMemory {
         }
         let mut areas = self.with(set_aside).resized(&layout);
         StoredMemory::new("", 0, other.clone()).copy_into(&mut areas, &layout);
-        Some(StoredMemory { name: format!("{}{SET_ASIDE}", self.name), id, layout, areas })
+        Some((layout, areas))
     }
 
     /// The areas, and the files that are known.

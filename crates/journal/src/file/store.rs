@@ -12,7 +12,7 @@ use redb::{
 
 use super::disk::Disk;
 use super::error::FileError;
-use super::image::{self, Changes, Image, Page, StoredMemory, page_key};
+use super::image::{self, Changes, Image, NoteChange, Page, StoredMemory, page_key};
 use super::status::Status;
 
 /// The newest version of the format: a memory may have files.
@@ -64,7 +64,7 @@ impl Store {
             None => (create(&*disk, &Image::default())?, Image::default()),
         };
         let store = Store { disk, database, image, in_doubt: false, status };
-        store.note(|status| status.bytes = store.bytes());
+        store.update_status(|status| status.bytes = store.bytes());
         Ok(store)
     }
 
@@ -80,7 +80,7 @@ impl Store {
     /// file.
     pub fn store(&mut self, changes: Changes) -> Result<(), FileError> {
         let began = Instant::now();
-        self.note(|status| status.busy_since = Some(began));
+        self.update_status(|status| status.busy_since = Some(began));
         let stored = self.try_store(changes);
         // After an I/O error, the file may be in its place.
         let is_away = stored.is_err()
@@ -89,7 +89,7 @@ impl Store {
                 Ok(true) | Err(FileError::Io(_) | FileError::FolderGone { was_removed: false })
             );
         let bytes = self.bytes();
-        self.note(|status| {
+        self.update_status(|status| {
             (status.busy_since, status.is_away) = (None, is_away);
             status.failing = stored.as_ref().err().map(ToString::to_string);
             if let Ok(true) = stored {
@@ -114,7 +114,7 @@ impl Store {
             self.database = create(&*self.disk, &image)?;
             self.image = image;
             self.in_doubt = false;
-            self.note(|status| status.recreated += u64::from(is_gone));
+            self.update_status(|status| status.recreated += u64::from(is_gone));
             return Ok(true);
         }
         if changes.is_empty() {
@@ -143,7 +143,7 @@ impl Store {
         self.disk.size().ok().flatten().unwrap_or_default()
     }
 
-    fn note(&self, change: impl FnOnce(&mut Status)) {
+    fn update_status(&self, change: impl FnOnce(&mut Status)) {
         change(&mut lock(&self.status));
     }
 }
@@ -181,7 +181,7 @@ fn create_beside(disk: &dyn Disk, image: &Image) -> Result<Database, FileError> 
     let transaction = database.begin_write()?;
     transaction.open_table(ABOUT)?.insert(FORMAT, FIRST_VERSION)?;
     let memories = image.memories.clone();
-    let note = image.note.clone().map(Some);
+    let note = image.note.clone().map_or(NoteChange::Keep, NoteChange::Set);
     write(&transaction, &Changes { memories, note, ..Changes::default() })?;
     transaction.commit()?;
     disk.install()?;
@@ -191,12 +191,13 @@ fn create_beside(disk: &dyn Disk, image: &Image) -> Result<Database, FileError> 
 fn write(transaction: &WriteTransaction, changes: &Changes) -> Result<(), FileError> {
     let mut records = transaction.open_table(MEMORIES)?;
     let mut pages = transaction.open_table(PAGES)?;
-    if let Some(note) = &changes.note {
-        let mut log = transaction.open_table(LOG)?;
-        match note {
-            Some(note) => drop(log.insert(NOTE, &*with_checksum(NOTE.as_bytes(), note))?),
-            None => drop(log.remove(NOTE)?),
+    match &changes.note {
+        NoteChange::Keep => {}
+        NoteChange::Set(note) => {
+            let note = with_checksum(NOTE.as_bytes(), note);
+            transaction.open_table(LOG)?.insert(NOTE, &*note)?;
         }
+        NoteChange::Remove => drop(transaction.open_table(LOG)?.remove(NOTE)?),
     }
     for (name, id) in &changes.removed {
         records.remove(&**name)?;
@@ -211,12 +212,12 @@ fn write(transaction: &WriteTransaction, changes: &Changes) -> Result<(), FileEr
         pages.retain_in((stored.id, 0, 0)..=(stored.id, u8::MAX, u16::MAX), |_, _| false)?;
         for (area, number, bytes) in stored.pages() {
             let key = page_key(stored.id, area, number);
-            pages.insert(key, &*with_checksum(&place(key), bytes))?;
+            pages.insert(key, &*with_checksum(&key_bytes(key), bytes))?;
         }
     }
     for Page { memory, area, number, bytes } in &changes.pages {
         let key = page_key(*memory, *area, *number);
-        pages.insert(key, &*with_checksum(&place(key), bytes))?;
+        pages.insert(key, &*with_checksum(&key_bytes(key), bytes))?;
     }
     Ok(())
 }
@@ -259,7 +260,7 @@ fn contents(database: &Database) -> Result<Image, FileError> {
                     |what| FileError::damaged(format!("{what} {number} of memory {}", stored.name));
                 let Some(entry) = entries.next() else { return Err(damaged("there is no page")) };
                 let (found, stored) = entry?;
-                let stored = checked(&place(key), stored.value());
+                let stored = checked(&key_bytes(key), stored.value());
                 match stored.filter(|stored| found.value() == key && stored.len() == page.len()) {
                     Some(stored) => page.copy_from_slice(stored),
                     None => return Err(damaged("wrong checksum of page")),
@@ -280,27 +281,28 @@ fn contents(database: &Database) -> Result<Image, FileError> {
     }
 }
 
-fn place((memory, area, number): (u16, u8, u16)) -> [u8; 5] {
+/// The bytes of a [`page_key`], for its checksum.
+fn key_bytes((memory, area, number): (u16, u8, u16)) -> [u8; 5] {
     let ([a, b], [c, d]) = (memory.to_be_bytes(), number.to_be_bytes());
     [a, b, area, c, d]
 }
 
-/// Bytes, and the checksum of them and of what they belong to.
-fn with_checksum(to: &[u8], bytes: &[u8]) -> Vec<u8> {
+/// Bytes, and the checksum of them and of their owner: the key at which they are stored.
+fn with_checksum(owner: &[u8], bytes: &[u8]) -> Vec<u8> {
     let mut stored = bytes.to_vec();
-    stored.extend(checksum(to, bytes).to_be_bytes());
+    stored.extend(checksum(owner, bytes).to_be_bytes());
     stored
 }
 
 /// The bytes, if their checksum is right.
-fn checked<'a>(to: &[u8], stored: &'a [u8]) -> Option<&'a [u8]> {
+fn checked<'a>(owner: &[u8], stored: &'a [u8]) -> Option<&'a [u8]> {
     let (bytes, found) = stored.split_last_chunk()?;
-    (checksum(to, bytes) == u32::from_be_bytes(*found)).then_some(bytes)
+    (checksum(owner, bytes) == u32::from_be_bytes(*found)).then_some(bytes)
 }
 
-fn checksum(to: &[u8], bytes: &[u8]) -> u32 {
+fn checksum(owner: &[u8], bytes: &[u8]) -> u32 {
     let mut hasher = crc32fast::Hasher::new();
-    hasher.update(to);
+    hasher.update(owner);
     hasher.update(bytes);
     hasher.finalize()
 }

@@ -31,7 +31,7 @@ impl Replica {
         self.0.encode()
     }
 
-    /// Loads a snapshot that was taken here, or of the place of this number.
+    /// Loads a snapshot that was taken here, or at this sequence.
     ///
     /// # Errors
     /// As those of a log.
