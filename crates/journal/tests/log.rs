@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use async_nats::jetstream::stream::Info;
 use futures_util::{StreamExt, TryStreamExt};
-use holdfast_journal::log::{LogError, LogReader, Phase, Settings, Until};
+use holdfast_journal::log::{LogError, LogReader, Phase, Record, Settings, Until};
 use holdfast_memory::{
     Access, Action, Area, Freshness, Memory, Mirrored, Operation, Outcome, Read, Refusal, Refused,
     Span, Step, StepWrite, Tenure, Term, Write, write_across,
@@ -410,6 +410,39 @@ fn messages_with_headers_that_nobody_can_read_are_ignored() {
         node.write(3, 3).unwrap();
     }
     until("a node that was there has it", || b.read(3) == Ok(3));
+}
+
+/// Servers with a JetStream of their own that are joined by a leaf node give each other what is published.
+#[test]
+fn messages_of_another_log_with_this_name_are_ignored() {
+    let (server, others) = (Server::new(), Server::new());
+    let (a, other) = (Node::started(&[&server], "a"), Node::started(&[&others], "other"));
+    other.write(0, 42).unwrap();
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    let message = runtime.block_on(async {
+        let client = async_nats::connect(others.url()).await.unwrap();
+        let stream = async_nats::jetstream::new(client).get_stream("holdfast-log-site").await;
+        let stream = stream.unwrap();
+        stream.get_raw_message(other.status().last_sequence).await.unwrap()
+    });
+    let id = message.headers.get("Holdfast-Log-Id").unwrap();
+    let headers = format!("NATS/1.0\r\nHoldfast-Log-Id: {id}\r\n\r\n");
+    publish_raw(&server, STEPS, headers.as_bytes(), &message.payload);
+    until("it is ignored", || a.status().ignored == 1);
+    let events = a.log.take_events(Duration::ZERO);
+    let ignored = events.iter().find(|event| event.name == "log_message_ignored").unwrap();
+    assert!(ignored.fields[1].1.starts_with("it is of another log with this name"), "{ignored:?}");
+    a.write(1, 1).unwrap();
+    let settings = Settings::new("site", "replay", vec![server.url()]);
+    let members = vec![("plant".to_owned(), memory_of(100))];
+    let mut reader = LogReader::open(&settings, members, Until::Now, nodes::DEADLINE).unwrap();
+    let records: Vec<_> = std::iter::from_fn(|| reader.next(nodes::DEADLINE).unwrap()).collect();
+    let steps = |record: &Record| (record.sequence.to_string(), record.steps.len());
+    assert!(records.iter().map(steps).any(|found| found == (ignored.fields[0].1.clone(), 0)));
+    assert_eq!(a.read(0), Ok(0));
+    // Older releases send no such header.
+    publish_raw(&server, STEPS, b"NATS/1.0\r\n\r\n", &message.payload);
+    until("it is applied", || a.status().nodes.contains_key("other"));
 }
 
 #[test]

@@ -12,9 +12,8 @@ use super::layout::fingerprint;
 use super::settings::Settings;
 use super::state::{Applied, State, StreamPosition, digest_of};
 use crate::log::stream::connection::connect;
-use crate::log::stream::message::{self, Origin};
+use crate::log::stream::message::{self, MessageError, Origin};
 use crate::log::stream::messages::{Fetched, fetched};
-use crate::log::stream::raw_message::Received;
 use crate::log::stream::store::{OpenAs, Pointer, Snapshot, Store};
 
 /// Where to end.
@@ -57,6 +56,7 @@ pub struct LogReader {
 struct Reading {
     state: State,
     messages: Fetched,
+    log_id: Option<String>,
 }
 
 impl LogReader {
@@ -173,7 +173,8 @@ impl Reading {
         loop {
             let received = self.messages.next().await;
             let ended = || Err(End::Lost("the messages have ended".to_owned()));
-            let Received { position, payload, .. } = received.unwrap_or_else(ended)?;
+            let received = received.unwrap_or_else(ended)?;
+            let position = received.position;
             if position.sequence < next {
                 continue;
             }
@@ -185,8 +186,14 @@ impl Reading {
                 return Ok(None);
             }
             // Also a message that was applied before is shown, with its steps.
-            let decoded = message::decode(&payload, &self.state.members).ok();
-            let applied = self.state.apply(position, &payload, |_| None)?;
+            let is_other = received.is_of_other_log(self.log_id.as_deref());
+            let decoded = message::decode(&received.payload, &self.state.members).ok();
+            let decoded = decoded.filter(|_| !is_other);
+            let applied = if is_other {
+                self.state.ignore(position, MessageError::OtherLog)
+            } else {
+                self.state.apply(position, &received.payload, |_| None)?
+            };
             let (fresh, outcomes, sealed) = match applied {
                 Applied::Fresh { outcomes, sealed, .. } => (true, outcomes, sealed),
                 Applied::Stale(_) | Applied::Ignored(_) => (false, Vec::new(), Vec::new()),
@@ -224,7 +231,7 @@ async fn read_from(
     store.load(snapshot, &mut state).await?;
     // Not a consumer: a message with malformed headers must not end it.
     let messages = fetched(store, state.position.sequence + 1);
-    Ok(Reading { state, messages })
+    Ok(Reading { state, messages, log_id: store.id().map(str::to_owned) })
 }
 
 /// The digest that the log leads to at a sequence, from the oldest snapshot that the stream goes on

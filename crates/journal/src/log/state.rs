@@ -135,11 +135,7 @@ impl State {
                     let what = "a message of the log";
                     return Err(LogError::Version { what, found, supported: VERSION });
                 }
-                // It has a place in the order all the same: all nodes ignore it there.
-                Err(error) => {
-                    self.position = position;
-                    return Ok(Applied::Ignored(error));
-                }
+                Err(error) => return Ok(self.ignore(position, error)),
             };
         self.position = position;
         // A message that was sent again, or one that a later start of its node has overtaken.
@@ -172,6 +168,12 @@ impl State {
             _ => Vec::new(),
         };
         Ok(Applied::Fresh { origin, compares, notice, outcomes, sealed })
+    }
+
+    /// Passes over the next message. It has a place in the order all the same: all nodes ignore it there.
+    pub(super) fn ignore(&mut self, position: StreamPosition, error: MessageError) -> Applied {
+        self.position = position;
+        Applied::Ignored(error)
     }
 
     /// Closes the seals that open once. Returns whose were open.

@@ -9,9 +9,9 @@ use crate::log::error::{End, LogError};
 use crate::log::parts::note::Note;
 use crate::log::settings::Settings;
 use crate::log::shared::{Checkpoint, Shared};
-use crate::log::state::{Applied, State, StreamPosition};
+use crate::log::state::{Applied, State};
 use crate::log::status::{Event, NodeStatus};
-use crate::log::stream::message::Origin;
+use crate::log::stream::message::{MessageError, Origin};
 use crate::log::stream::raw_message::Received;
 
 /// The contents of this node, and which stream they come from.
@@ -88,18 +88,21 @@ impl Applier {
         if position.sequence != applied.sequence + 1 {
             return Err(End::missing(applied.sequence + 1, position.sequence - 1));
         }
-        self.apply(position, &received.payload, first_sent).map(Some)
+        self.apply(received, first_sent).map(Some)
     }
 
     fn apply(
         &mut self,
-        position: StreamPosition,
-        payload: &[u8],
+        received: &Received,
         first_sent: impl FnOnce(&Origin) -> Option<Moment>,
     ) -> Result<Applied, End> {
-        let shared = &self.shared;
+        let (shared, position) = (&self.shared, received.position);
         let age = |origin: &Origin| shared.age_since(first_sent(origin));
-        let applied = self.state.apply(position, payload, age)?;
+        let applied = if received.is_of_other_log(self.stream_id.as_deref()) {
+            self.state.ignore(position, MessageError::OtherLog)
+        } else {
+            self.state.apply(position, &received.payload, age)?
+        };
         shared.counters.sequence.set(position.sequence);
         match &applied {
             Applied::Fresh { origin, .. } => {

@@ -21,6 +21,7 @@ use crate::log::shared::Shared;
 use crate::log::state::State;
 use crate::log::status::Event;
 use crate::log::stream::message::{self, Notice, OVERHEAD_BYTES, Origin};
+use crate::log::stream::raw_message::LOG_ID;
 use crate::log::stream::store::{subject, unique};
 
 /// The most bytes of steps that are sent in one message with others.
@@ -77,6 +78,7 @@ enum Start {
 pub(in crate::log) struct Publisher {
     client: Client,
     subject: String,
+    log_id: Option<String>,
     /// The prefix of the subjects of acknowledgements.
     inbox: String,
     /// The most bytes of encoded steps that the servers accept in one message.
@@ -342,9 +344,14 @@ impl Sender {
 }
 
 impl Publisher {
-    pub(in crate::log) fn new(client: Client, settings: &Settings) -> Publisher {
+    pub(in crate::log) fn new(
+        client: Client,
+        settings: &Settings,
+        log_id: Option<&str>,
+    ) -> Publisher {
         Publisher {
             subject: subject(&settings.name),
+            log_id: log_id.map(str::to_owned),
             inbox: client.new_inbox(),
             max_steps_bytes: client
                 .server_info()
@@ -374,6 +381,9 @@ impl Publisher {
         let mut headers = HeaderMap::new();
         // The servers themselves drop a message that they have stored lately.
         headers.insert(header::NATS_MESSAGE_ID, origin.message_id().as_str());
+        if let Some(id) = &self.log_id {
+            headers.insert(LOG_ID, id.as_str());
+        }
         let reply = format!("{}.{}", self.inbox, origin.counter);
         let published = self.client.publish_with_reply_and_headers(
             self.subject.clone(),

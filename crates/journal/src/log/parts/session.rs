@@ -107,7 +107,7 @@ impl<'n> Session<'n> {
         let from = join(node, &store).await?;
         mend_keys(node, &store).await?;
         let messages = Messages::new(&store, from);
-        let publisher = Publisher::new(connected.client.clone(), settings);
+        let publisher = Publisher::new(connected.client.clone(), settings, store.id());
         let acks = node.run_with_expiry(publisher.acknowledgements()).await??;
         let watched = [SNAPSHOT_KEY.to_owned(), format!("{DIGEST_KEY_PREFIX}>")];
         let watch = node.run_with_expiry(store.keys.watch_many_with_history(watched)).await?;

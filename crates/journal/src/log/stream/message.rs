@@ -101,6 +101,11 @@ pub(in crate::log) enum MessageError {
     Version(u8),
     #[error("it was not sent by a node")]
     Foreign,
+    #[error(
+        "it is of another log with this name, whose servers are joined with these (as by a leaf node) and have a \
+         JetStream of their own: give one of the logs another name"
+    )]
+    OtherLog,
     #[error("it is malformed")]
     Malformed,
     #[error("it is of a node beyond the {MAX_NODES} that a log may have had")]

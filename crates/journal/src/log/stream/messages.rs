@@ -14,7 +14,7 @@ use futures_util::{FutureExt, StreamExt};
 
 use crate::log::error::End;
 use crate::log::state::StreamPosition;
-use crate::log::stream::raw_message::Received;
+use crate::log::stream::raw_message::{Received, log_id};
 use crate::log::stream::store::Store;
 
 /// How many requests for messages are in flight.
@@ -88,7 +88,8 @@ fn delivered(message: &async_nats::jetstream::Message) -> Result<Received, End> 
     let stored = info.published.unix_timestamp_nanos() as i64;
     let position = StreamPosition { sequence: info.stream_sequence, stored };
     let (payload, last) = (message.payload.clone(), position.sequence + info.pending);
-    Ok(Received { position, payload, last, is_readable: true })
+    let log_id = log_id(message.headers.as_ref());
+    Ok(Received { position, payload, last, is_readable: true, log_id })
 }
 
 /// Fetches messages from this sequence on. After the last one, waits for further ones.

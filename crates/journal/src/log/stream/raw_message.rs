@@ -1,5 +1,6 @@
 //! A message of a stream, whatever its headers are.
 
+use async_nats::HeaderMap;
 use async_nats::jetstream::message::StreamMessage;
 use async_nats::jetstream::response::Response;
 use async_nats::jetstream::stream::RawMessage;
@@ -22,6 +23,16 @@ pub(in crate::log) struct Received {
     pub(in crate::log) last: u64,
     /// Whether a consumer can deliver it.
     pub(in crate::log) is_readable: bool,
+    /// The log that its sender belongs to. `None` if it does not say so, as those of older releases.
+    pub(in crate::log) log_id: Option<String>,
+}
+
+/// The header that says which log the sender of a message belongs to. Servers with a JetStream of their own that
+/// are joined, as by a leaf node, store the messages of all logs of one name in each of these.
+pub(in crate::log) const LOG_ID: &str = "Holdfast-Log-Id";
+
+pub(in crate::log) fn log_id(headers: Option<&HeaderMap>) -> Option<String> {
+    headers?.get(LOG_ID).map(|id| id.as_str().to_owned())
 }
 
 /// A message in JSON: its headers can't end the connection. `None` if the stream does not have it.
@@ -46,6 +57,11 @@ pub(in crate::log) async fn fetch(
 }
 
 impl Received {
+    /// Whether it was sent to another log than the one with this id.
+    pub(in crate::log) fn is_of_other_log(&self, id: Option<&str>) -> bool {
+        self.log_id.is_some() && self.log_id.as_deref() != id
+    }
+
     /// A message as a server describes it.
     fn of(message: RawMessage) -> Result<Received, async_nats::Error> {
         let is_plain = |headers: &String| headers.starts_with(WITHOUT_STATUS);
@@ -53,11 +69,13 @@ impl Received {
         let breaks = |c: char| c.is_whitespace() || c == char::REPLACEMENT_CHARACTER;
         // The client library refuses to convert a message whose headers it can't parse.
         let without_headers = RawMessage { headers: None, ..message.clone() };
-        let is_readable = message.headers.as_ref().is_none_or(is_plain)
-            && !message.subject.contains(breaks)
-            && StreamMessage::try_from(message).is_ok();
+        let is_plain = message.headers.as_ref().is_none_or(is_plain);
+        let has_subject = !message.subject.contains(breaks);
+        let parsed = StreamMessage::try_from(message);
+        let is_readable = is_plain && has_subject && parsed.is_ok();
+        let log_id = parsed.ok().and_then(|parsed| log_id(Some(&parsed.headers)));
         let StreamMessage { sequence, payload, time, .. } = without_headers.try_into()?;
         let position = StreamPosition { sequence, stored: time.unix_timestamp_nanos() as i64 };
-        Ok(Received { position, payload, last: sequence, is_readable })
+        Ok(Received { position, payload, last: sequence, is_readable, log_id })
     }
 }

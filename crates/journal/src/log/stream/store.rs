@@ -37,6 +37,9 @@ const LEASE_TTL: Duration = Duration::from_secs(30);
 /// How long one part of a snapshot may take to arrive.
 const SNAPSHOT_READ_TIMEOUT: Duration = Duration::from_secs(10);
 
+/// A snapshot is stored in parts of so many bytes, or of as many as the servers accept in a message.
+const MAX_PART_BYTES: usize = 128 << 10;
+
 /// No snapshot is longer than this.
 const MAX_SNAPSHOT_BYTES: u64 = 1 << 30;
 
@@ -383,7 +386,11 @@ impl Store {
         mut snapshot: Snapshot,
     ) -> Result<(u64, Pointer), String> {
         snapshot.object = format!("{}-{}-{}", snapshot.sequence, snapshot.node, snapshot.object);
-        let object = ObjectMetadata { name: snapshot.object.clone(), ..ObjectMetadata::default() };
+        let object = ObjectMetadata {
+            name: snapshot.object.clone(),
+            chunk_size: Some(MAX_PART_BYTES.min(self.context.client().max_payload())),
+            ..ObjectMetadata::default()
+        };
         let mut bytes = encoded;
         match self.objects.put(object, &mut bytes).await {
             Ok(object) => snapshot.nuid = Some(object.nuid),
