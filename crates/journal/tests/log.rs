@@ -579,6 +579,18 @@ fn snapshots_for_which_there_is_no_room_leave_nothing() {
     assert_eq!(object_subjects(&server), before);
 }
 
+#[test]
+fn parts_of_a_snapshot_are_as_small_as_the_servers_accept() {
+    let folder = nodes::Folder::new();
+    let config = folder.0.join("config");
+    std::fs::write(&config, "max_payload: 65536").unwrap();
+    let config = config.to_str().unwrap().to_owned();
+    let server = Server::with(nodes::free_port(), &["-c".to_owned(), config]);
+    let node = Node::with(memory_of(65_536), &[&server], "a", |_| ());
+    node.start();
+    node.write(0, 1).unwrap();
+}
+
 /// The subjects of all that the bucket of the snapshots has.
 fn object_subjects(server: &Server) -> HashSet<String> {
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
