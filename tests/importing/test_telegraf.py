@@ -965,6 +965,11 @@ def test_requests_are_no_longer_than_those_of_the_source(
     given = "  [inputs.modbus.workarounds]\n    max_word_registers_per_request = 20\n"
     line = imported(REQUEST + more % (6, 10) + given).data["devices"]["line-1"]
     assert line["max_registers"] == 20
+    found = imported(REQUEST + more % (6, 10) + given.replace("20", "1"))
+    assert found.data["devices"]["line-1"]["max_registers"] == 4
+    assert any(
+        "max_word_registers_per_request: changed: raised to 4" in each for each in notes(found)
+    )
     assert "max_registers" not in device(imported(changed("address=20,", "address=10,", METRIC)))
 
 

@@ -20,6 +20,7 @@ from holdfast.importing.telegraf.fields import STYLES, Field, Fields
 from holdfast.importing.telegraf.reasons import FILTERS, LOGGED
 from holdfast.net.addresses import joined
 from holdfast.protocol import MAX_UNIT, READ_BITS, READ_REGISTERS
+from holdfast.values import register_count
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -104,9 +105,21 @@ class InputReader:
                 data: dict[str, Any] = {"url": url, "unit": number, **timing}
                 if self.tolerance:
                     data["tolerance"] = dict(self.tolerance)
-                data |= unit.settings(one.desk, its_fields, self.limits)
+                data |= unit.settings(one.desk, its_fields, self._limits(its_fields))
                 made.append(Device(one.at("name"), name, number, series, data, its_fields))
         return made
+
+    def _limits(self, fields: list[Field]) -> dict[str, int]:
+        """The limits that the source names. No request is shorter than the longest field."""
+        most = self.limits.get("max_registers")
+        types = (each.tag.get("type", "bool") for each in fields)
+        longest = min(max(map(register_count, types)), READ_REGISTERS)
+        if most is None or longest <= most:
+            return self.limits
+        path = (*self.input.at("workarounds"), "max_word_registers_per_request")
+        message = f"raised to {longest}, the registers of the longest field: one request reads it"
+        self.input.desk.changed(path, message)
+        return self.limits | {"max_registers": longest}
 
     def _check_serial_unit(self, number: int) -> None:
         if number == 0:
