@@ -461,6 +461,19 @@ def test_a_reload_forgets_the_value_of_a_tag_with_another_meaning(
     assert {each.name for each in found.latest()} == {"on", "label", "phases"}
 
 
+def test_a_poll_of_other_ranges_is_none_of_a_device(tmp_path: Path) -> None:
+    made = settings(502)
+    found = TagValues(cast("Any", Polls()))
+    before = adopt(found, load(saved(tmp_path, made)))
+    made["devices"]["m"]["max_registers"] = 2
+    assert adopt(found, load(saved(tmp_path, made))) == before, "all tags still fit"
+    made["devices"]["m"]["max_registers"] = 1
+    config = load(saved(tmp_path, made))
+    now = found.tagged(config, config.devices)["m"]
+    assert now.reported_as != before["m"]
+    assert ("holding_registers", 5, 1) in now.reader.fields
+
+
 @pytest.mark.parametrize("is_moved", [False, True])
 def test_after_a_reload_a_device_is_read_at_once(
     tmp_path: Path, device: int, serve: Serve, is_moved: bool

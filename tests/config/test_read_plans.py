@@ -450,6 +450,16 @@ def test_the_plan_of_a_configuration_for_programs(file: str) -> None:
     }
 
 
+def test_the_plan_of_a_long_array_ends_where_an_element_ends(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    tags = "{flows: {area: input_registers, address: 0, type: 'uint32[100]'}}"
+    file.write_text(f"devices:\n  a: {{url: tcp://10.0.0.5, interval: 1, tags: {tags}}}\n")
+    counts = [124, 76], [100, 100]
+    for options, expected in zip(([], ["--max-registers", "101"]), counts, strict=True):
+        [plan] = answer("check", "plan", str(file), *options)["plans"]
+        assert [block["count"] for block in plan["blocks"]] == expected
+
+
 def test_options_take_the_place_of_what_a_configuration_says(file: str) -> None:
     assert done("check", "plan", file, "--device", "meter", "--max-gap", "14")[-1] == (
         "1 request, 18 extra addresses read"

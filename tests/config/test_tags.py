@@ -178,6 +178,19 @@ def test_a_device_must_be_able_to_read_a_value_with_its_scale(
     )
 
 
+def test_a_request_must_be_able_to_read_a_number(tmp_path: Path) -> None:
+    tags = (
+        "{flow: {area: input_registers, address: 0, type: 'uint32[9]'}, "
+        "name: {area: input_registers, address: 0, type: 'string:8'}}"
+    )
+    device = f"{{url: tcp://10.0.0.5, interval: 1, max_registers: 1, tags: {tags}}}"
+    [problem] = problems(written(tmp_path, f"devices:\n  a: {device}\n"))
+    assert problem == (
+        "p.yaml:2: devices.a.tags.flow.type: a number of uint32[9] has 2 registers, max_registers "
+        "is 1, and all of them must be from one request"
+    )
+
+
 def test_a_device_cannot_move_a_scale_out_of_reach(tmp_path: Path) -> None:
     own = "tags: {sf: {area: holding_registers, address: 1}}"
     device = f"{{url: tcp://10.0.0.5, profile: meter, interval: 1, {own}}}"

@@ -314,6 +314,21 @@ def test_a_scale_that_no_request_can_reach_is_told(device: holdfast.Server, poll
     }
 
 
+def test_a_number_is_from_one_request(
+    device: holdfast.Server, memory: holdfast.Memory, poller: Poller
+) -> None:
+    memory.write("holding_registers", 0, [0, 1, 0, 2])
+    tags = {
+        "whole": ("holding_registers", 0, "uint32[2]"),
+        "wide": ("holding_registers", 0, "uint64"),
+    }
+    poller.add(url(device), tags, max_registers=3)
+    assert [(each.value, each.error) for each in taken(poller)] == [
+        ([1, 2], None),
+        (None, "no request has read it whole"),
+    ]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

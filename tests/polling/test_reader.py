@@ -47,3 +47,13 @@ def test_a_scale_of_another_request_is_never_taken() -> None:
     assert read(block(0, 432, 0), block(2, 0, 1)) == {"power": none, "sf": (1, 0, None)}
     failed: PolledBlock = (HR, 0, 4, None, 2, 1.0)
     assert read(failed, block(3, 1)) == {"power": (None, 2, None), "sf": (1, 0, None)}
+
+
+def test_an_element_of_an_array_is_never_from_two_requests() -> None:
+    reader = Reader("meter", [Tag("counters", HR, 0, "uint32[3]")], 5)
+    assert list(reader.fields) == [(HR, 0, 4), (HR, 4, 2)]
+    halves = block(0, 0, 1, 0, 2, 7, 8), block(4, 7, 8), block(0, 0, 1, 0, 2)
+    assert [each.value for each in reader.poll(halves[:1]).readings] == [[1, 2, 0x70008]]
+    assert [each.value for each in reader.poll(halves[1:]).readings] == [[1, 2, 0x70008]]
+    [reading] = reader.poll([block(0, 0, 1, 0, 2, 0), block(5, 8)]).readings
+    assert (reading.value, reading.error) == (None, "no request has read it whole")

@@ -77,36 +77,60 @@ def test_registers_without_a_value_leave_the_others_as_they_are() -> None:
 
 
 @pytest.mark.parametrize(
+    ("kind", "parts"),
+    [
+        ("uint32[6]", [(10, 4), (14, 4), (18, 4)]),
+        ("uint16[6]", [(10, 5), (15, 1)]),
+        ("float64[2]", [(10, 4), (14, 4)]),
+        ("string:6[2]", [(10, 3), (13, 3)]),
+        ("uint32[2]", [(10, 4)]),
+        # A text that does not fit is cut, a number is not.
+        ("string:12", [(10, 5), (15, 1)]),
+    ],
+)
+def test_a_part_has_whole_elements(kind: str, parts: list[tuple[int, int]]) -> None:
+    found = register("a", 10, kind).parts(5, 2000)
+    assert [(part.start, len(part)) for part in found] == parts
+    [whole] = register("a", 10, "uint64[2]").parts(3, 2000)
+    assert whole == range(10, 18)
+    assert coil(10, "bool[3]").parts(125, 2) == [range(10, 12), range(12, 13)]
+
+
+@pytest.mark.parametrize(
     ("pieces", "data"),
     [
         ([(10, registers(1, 2)), (12, registers(3))], registers(1, 2, 3)),
         ([(12, registers(3)), (10, registers(1, 2))], registers(1, 2, 3)),
-        ([(8, registers(7, 8, 1)), (11, registers(2, 3, 9, 9))], registers(1, 2, 3)),
+        ([(8, registers(7, 8, 1, 2, 3, 9, 9))], registers(1, 2, 3)),
+        ([(8, registers(7, 8, 1, 2)), (11, registers(0, 3))], registers(1, 2, 3)),
+        ([(8, registers(7, 8, 1)), (11, registers(2, 3))], None),
         ([(10, registers(1, 2))], None),
         ([(11, registers(2, 3))], None),
-        ([(10, registers(1)), (12, registers(3))], None),
         ([], None),
     ],
     ids=repr,
 )
-def test_a_tag_is_assembled_from_all_of_its_registers(
+def test_a_tag_is_assembled_from_whole_parts(
     pieces: list[tuple[int, bytes]], data: bytes | None
 ) -> None:
-    assert assembled(register("a", 10, "uint16[3]"), pieces) == data
+    tag, parts = register("a", 10, "uint16[3]"), [range(10, 12), range(12, 13)]
+    counted = [(address, len(read) // 2, read) for address, read in pieces]
+    assert assembled(tag, parts, counted) == data
 
 
 def test_a_bit_that_is_off_is_not_one_that_is_missing() -> None:
-    tag = coil(10, "bool[3]")
-    assert assembled(tag, [(9, b"\x02"), (12, b"\x00")]) == b"\x01"
-    assert assembled(tag, [(3, b"\xff")]) is None
+    tag, parts = coil(10, "bool[3]"), [range(10, 12), range(12, 13)]
+    assert assembled(tag, parts, [(9, 3, b"\x02"), (12, 1, b"\x00")]) == b"\x01"
+    assert assembled(tag, parts, [(12, 1, b"\x01"), (9, 3, b"\x02")]) == b"\x05"
+    assert assembled(tag, parts, [(9, 3, b"\xfa")]) is None, "a byte has more bits than were read"
 
 
 @pytest.mark.parametrize("count", [1, 7, 8, 9, 16, 17])
 def test_bits_are_assembled_to_as_many_bytes_as_they_need(count: int) -> None:
     tag = coil(5, f"bool[{count}]")
     number = 0b1_0110_1001_1010_0110 & ((1 << count) - 1)
-    pieces = [(5 + 8 * at, bytes([number >> 8 * at & 0xFF])) for at in range((count + 7) // 8)]
-    data = assembled(tag, pieces)
+    pieces = [(5 + 8 * at, 8, bytes([number >> 8 * at & 0xFF])) for at in range((count + 7) // 8)]
+    data = assembled(tag, tag.parts(125, 8), pieces)
     assert data == number.to_bytes((count + 7) // 8, "little")
     assert value_of(tag, data, 5) == [bool(number >> bit & 1) for bit in range(count)]
 

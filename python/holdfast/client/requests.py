@@ -29,6 +29,7 @@ from holdfast.runtime.text import listing
 from holdfast.types import AREAS, BIT_AREAS, SHORT_AREAS, WRITABLE_AREAS
 from holdfast.values.codec import codec_for
 from holdfast.values.errors import UnknownType
+from holdfast.values.types import whole_elements
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -128,7 +129,7 @@ def read_range(area: Area, address: int, count: int, element: int = 1) -> Plan[l
     address, count = index(address), index(count)
     if count <= limit:
         return Request.read(area, address, count)
-    size = _whole_elements(limit, element)
+    size = whole_elements(limit, element)
     return _in_turn(
         [
             Request.read(area, start, min(size, address + count - start))
@@ -198,7 +199,7 @@ def write_range(
     with contextlib.suppress(ValueError):  # There are too many items for one request.
         make(address, items)  # Refuses what is not a sequence of integers, such as a mapping.
     items = list(items)  # Not every sequence has slices.
-    size = _whole_elements(limit, element)
+    size = whole_elements(limit, element)
     starts = _starts(address, len(items), size)
     try:
         requests = [
@@ -272,11 +273,6 @@ def diagnostics(sub_function: int, data: Sequence[int]) -> Steps[list[int]]:
     """Sends and receives data words (function 8)."""
     reply: bytes = yield Request.diagnostics(sub_function, data)
     return [int.from_bytes(reply[at : at + 2], "big") for at in range(0, len(reply), 2)]
-
-
-def _whole_elements(limit: int, element: int) -> int:
-    """The most registers of a request with whole elements; `limit` if not even one fits."""
-    return limit // element * element or limit
 
 
 def _starts(address: int, count: int, limit: int) -> range:

@@ -166,7 +166,7 @@ class Poller:
                     others = f"but other devices at this address have {known[option]!r}"
                     raise ValueError(f"{url!r}: {option} is {value!r}, {others}, allowed: the same")
             core_name = f"{name}#{next(self._generations)}"
-            reader = Reader(name, listed)
+            reader = Reader(name, listed, max_registers, max_bits)
             self._poller.add(
                 _core.PolledDevice(
                     core_name,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from holdfast.polling.faults import fault_text, is_exception
+from holdfast.protocol import READ_BITS, READ_REGISTERS
 from holdfast.tags.decoding import Places, Undecoded, assembled, decoder, value_of
 
 if TYPE_CHECKING:
@@ -92,11 +93,18 @@ MAX_BLOCKS = 4096
 class Reader:
     """Reads the tags of one device from the blocks of its polls."""
 
-    def __init__(self, device: str, tags: Iterable[Tag]) -> None:
+    def __init__(
+        self,
+        device: str,
+        tags: Iterable[Tag],
+        max_registers: int = READ_REGISTERS,
+        max_bits: int = READ_BITS,
+    ) -> None:
         self.device = device
         self.tags = tuple(tags)
         self.named = {tag.name: tag for tag in self.tags}
         """The tags, by name."""
+        self._parts = {tag.name: tag.parts(max_registers, max_bits) for tag in self.tags}
         self._places = Places(self.tags)
         self._blocks: dict[tuple[Area, int, int], tuple[Sequence[Tag], Decoder | None]] = {}
 
@@ -105,7 +113,8 @@ class Reader:
         """What has to be read: areas, addresses and counts, each with the names of its tags."""
         found: dict[tuple[Area, int, int], list[str]] = {}
         for tag in self.tags:
-            found.setdefault((tag.area, tag.span.start, len(tag.span)), []).append(tag.name)
+            for part in self._parts[tag.name]:
+                found.setdefault((tag.area, part.start, len(part)), []).append(tag.name)
         return found
 
     def poll(self, blocks: Sequence[PolledBlock]) -> DevicePoll:
@@ -136,8 +145,8 @@ class Reader:
             if tag.name in found:
                 continue
             pieces = [block for block in blocks if block[0] == tag.area and _overlap(tag, block)]
-            parts = [(piece[1], piece[3]) for piece in pieces if piece[3] is not None]
-            data = assembled(tag, parts) if tag.source is None else None
+            read = [(piece[1], piece[2], piece[3]) for piece in pieces if piece[3] is not None]
+            data = assembled(tag, self._parts[tag.name], read)
             faulty = [block for block in [*pieces, *blocks[-1:]] if block[4]]
             if data is not None:
                 yield tag.name, self._reading(tag, value_of(tag, data, tag.address), pieces[-1][5])
@@ -145,7 +154,8 @@ class Reader:
                 *_, fault, time = faulty[0]
                 yield tag.name, Reading(self.device, tag, None, time, fault)
             elif blocks:
-                # A request of at most `max_registers` may not reach from a value to its scale.
+                # A request of at most `max_registers` may be too short for a number, or not reach
+                # from a value to its scale.
                 whole = "whole" if tag.source is None else "together with its scale"
                 why = f"no request has read it {whole}"
                 yield tag.name, Reading(self.device, tag, None, blocks[-1][5], 0, why)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from operator import index
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from holdfast.types import BIT_AREAS
-from holdfast.values.types import parsed
+from holdfast.values.types import parsed, whole_elements
 
 if TYPE_CHECKING:
     from collections.abc import Set
@@ -85,6 +86,22 @@ class BaseTag(ABC):
         if of is None:
             return range(self.address, self.end)
         return range(min(self.address, of.address), max(self.end, of.end))
+
+    def parts(self, max_registers: int, max_bits: int) -> list[range]:
+        """The addresses that one request must read, for each request of at most this length.
+
+        An array that is longer is cut between its elements: a device may change them between two
+        requests, and half of a number and half of another one are a third. Only a text that does
+        not fit into a request is cut itself, as by a client. What is longer than a request in spite
+        of this is not read.
+        """
+        span, of_type = self.span, parsed(self.type)
+        most = max(1, index(max_bits if self.of_bits else max_registers))  # The core refuses 0.
+        element = 1 if self.of_bits else of_type.width // 2
+        if self.source is not None or len(span) <= most or (of_type.is_number and element > most):
+            return [span]
+        size = whole_elements(most, element)
+        return [span[at : at + size] for at in range(0, len(span), size)]
 
     @property
     def of_bits(self) -> bool:

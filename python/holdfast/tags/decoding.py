@@ -133,25 +133,29 @@ def value_of(tag: BaseTag, data: bytes, address: int) -> Any:
     return raw if source is None else _scaled(tag, raw, _alone(source, data, address))
 
 
-def assembled(tag: BaseTag, pieces: Sequence[tuple[int, bytes]]) -> bytes | None:
+def assembled(
+    tag: BaseTag, parts: Sequence[range], pieces: Sequence[tuple[int, int, bytes]]
+) -> bytes | None:
     """The bytes of a tag that several requests have read; `None` if something is missing.
 
-    `pieces` are addresses and bytes. A scale in a register is only valid in the request that has
-    read it, so there are no pieces of such tags.
+    `pieces` are addresses, counts and bytes. Each of the `parts` of the tag is from one of them.
     """
-    assert tag.source is None, "a value and its scale are from one request"
-    units: dict[int, bytes | bool] = {}
-    for address, data in pieces:
-        of_piece: Sequence[bytes | bool] = (
-            _unpacked(data) if tag.of_bits else [data[at : at + 2] for at in range(0, len(data), 2)]
+    bits: list[bool] = []
+    registers = b""
+    for part in parts:
+        whole = (
+            (part.start - address, part.stop - address, data)
+            for address, count, data in pieces
+            if address <= part.start and part.stop <= address + count
         )
-        units.update(enumerate(of_piece, address))
-    content: list[Any] = [units.get(address) for address in range(tag.address, tag.end)]
-    if None in content:
-        return None
-    if not tag.of_bits:
-        return b"".join(content)
-    return packed(content)
+        if (found := next(whole, None)) is None:
+            return None
+        first, last, data = found
+        if tag.of_bits:
+            bits += _unpacked(data)[first:last]
+        else:
+            registers += data[2 * first : 2 * last]
+    return packed(bits) if tag.of_bits else registers
 
 
 def packed(bits: Sequence[bool]) -> bytes:

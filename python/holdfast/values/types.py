@@ -93,6 +93,11 @@ def _width(base: str, parameter: int | None) -> int | None:
     return None
 
 
+def whole_elements(most: int, element: int) -> int:
+    """The most registers, up to `most`, with whole elements; `most` if not even one fits."""
+    return most // element * element or most
+
+
 USUAL_NAMES = {
     "bit": "bit:0",
     "boolean": "bool",

@@ -87,10 +87,11 @@ class TaggedDevice(NamedTuple):
     """Its name in polls, which is another one after a change of what is read: polls may be late."""
 
     @property
-    def contents(self) -> tuple[object, dict[str, object]]:
-        """What is read: the source, and the place and meaning of each tag."""
+    def contents(self) -> tuple[object, object, Mapping[str, object]]:
+        """What is read: the source, the ranges, and the place and meaning of each tag."""
         tags = self.reader.named.items()
-        return self.source, {name: tag.place_and_meaning for name, tag in tags}
+        meanings = {name: tag.place_and_meaning for name, tag in tags}
+        return self.source, self.reader.fields, meanings
 
 
 def _identities(tagged: Mapping[str, TaggedDevice]) -> set[tuple[str, str]]:
@@ -199,7 +200,8 @@ class TagValues:
                 continue
             known = self._tagged.get(name)
             if known is None or name in changed:
-                source, reader = destination(config, name), Reader(name, tags)
+                source = destination(config, name)
+                reader = Reader(name, tags, device.max_registers, device.max_bits)
                 now = TaggedDevice(source, reader, f"{name}#{next(self._numbers)}")
                 if known is None or known.contents != now.contents:
                     known = now

@@ -189,7 +189,8 @@ def _of_file(
             rules["max_gap"] = rules["cost"] = None
         rules |= given  # type: ignore[typeddict-item]
         asked = [(read.area, read.address, read.count) for read in settings.reads]
-        fields = Reader(name, config.tags(name)).fields
+        limits = rules["max_registers"], rules["max_bits"]
+        fields = Reader(name, config.tags(name), *limits).fields
         planned = read_plans.plan([*asked, *fields], rules)
         tags = [*[()] * len(asked), *fields.values()]
         yield _Shown(planned, rules, settings.url, tags, name, settings)

@@ -281,7 +281,11 @@ def _pauses(config: Config, name: str, device: DeviceConfig) -> tuple[float, int
     if (not tolerance.has_pauses and not tolerance.reconnect) or device.max_gap == "auto":
         return 0, 0
     reads = [(read.area, read.address, read.count) for read in device.reads]
-    tags = [(tag.area, tag.span.start, len(tag.span)) for tag in config.tags(name)]
+    tags = [
+        (tag.area, part.start, len(part))
+        for tag in config.tags(name)
+        for part in tag.parts(device.max_registers, device.max_bits)
+    ]
     requests = len(read_plans.plan([*reads, *tags], read_plans.rules(device)).blocks)
     connections = requests / tolerance.close_after if tolerance.close_after else 0
     connecting = max(tolerance.reconnect + tolerance.pause_after_connect, tolerance.pause)

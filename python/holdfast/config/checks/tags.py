@@ -114,6 +114,10 @@ def _flaws(tag: Tag, device: DeviceConfig) -> Iterator[tuple[str, str]]:
             place = str(tag.address) if len(span) == 1 else extent(span)
             message = f"found {place}, which overlaps {overlapped}, allowed: other addresses"
             yield "address", message
+        number, most = tag.of_type.width // 2, device.max_registers
+        if tag.of_type.is_number and number > most:
+            found = f"a number of {tag.type} has {number} registers, max_registers is {most}"
+            yield "type", f"{found}, and all of them must be from one request"
         return
     assert isinstance(tag.scale, RegisterScale), "others have no source"
     where, both = tag.scale.where, "and a value is only read together with its scale"
