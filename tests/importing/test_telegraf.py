@@ -10,13 +10,15 @@ import pytest
 
 from holdfast.config import ConfigError, load
 from holdfast.importing import NotImportable, read_telegraf
+from holdfast.outputs.line_protocol import lines
+from holdfast.polling import Reading
+from holdfast.tags import Tag
 from holdfast.values import decode
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from holdfast.importing import Imported
-    from holdfast.tags import Tag
 
 REGISTER = """\
 [agent]
@@ -799,9 +801,46 @@ def test_a_type_that_influxdb_would_refuse_is_named(imported: Callable[[str], Im
     text = changed(', data_type = "BOOL"', "", text)
     assert (
         "16: outputs.influxdb_v2[0]: check: run, voltage have another type than in Telegraf "
-        "(bits are booleans, whole numbers integers, those of uint64 floats); InfluxDB refuses "
-        "them in the same measurement of a bucket: use another bucket"
+        "(bits are booleans, whole numbers integers, or floats if some are beyond int64); InfluxDB "
+        "refuses them in the same measurement of a bucket: use another bucket"
     ) in notes(imported(text))
+
+
+@pytest.mark.parametrize(
+    ("kind", "scale", "was_float"),
+    [
+        ("INT64", 1, False),
+        ("INT64", -1, False),
+        ("INT64", 10, False),
+        ("UINT64", 1, False),
+        ("INT32", 1000, False),
+        ("INT16", 0.1, False),
+        ("FIXED", 1, True),
+        ("FIXED", 10, True),
+        ("FIXED", 0.1, True),
+    ],
+)
+def test_the_named_fields_are_those_of_another_type_in_line_protocol(
+    imported: Callable[[str], Imported], kind: str, scale: float, was_float: bool
+) -> None:
+    width = {"INT16": 1, "INT32": 2}.get(kind, 4)
+    text = f"""\
+[[inputs.modbus]]
+  name = "line"
+  controller = "tcp://10.0.0.5:502"
+  [[inputs.modbus.holding_registers]]
+    name = "count"
+    byte_order = "{"ABCDEFGH"[: 2 * width]}"
+    data_type = "{kind}"
+    scale = {scale}
+    address = {list(range(width))}
+"""
+    found = imported(text + OUTPUT)
+    is_named = any("count have another type" in each for each in notes(found))
+    [(name, settings)] = device(found)["tags"].items()
+    tag = Tag(name, **settings)
+    written = lines([Reading("line", tag, tag.value(5), 0)], "modbus", {}).split()[1]
+    assert is_named == (was_float == written.endswith(b"i"))
 
 
 def test_measurements(imported: Callable[[str], Imported]) -> None:

@@ -255,6 +255,6 @@ class _Import:
             some = listing(names[:_MAX_SHOWN_FIELDS])
             more = f" and {len(names) - _MAX_SHOWN_FIELDS} more" * (len(names) > _MAX_SHOWN_FIELDS)
             message = f"{some}{more} have another type than in Telegraf (bits are booleans, "
-            message += "whole numbers integers, those of uint64 floats)"
+            message += "whole numbers integers, or floats if some are beyond int64)"
             advice = "InfluxDB refuses them in the same measurement of a bucket: use another bucket"
             self.desk.check(output.path, f"{message}; {advice}")

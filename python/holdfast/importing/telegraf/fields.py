@@ -431,15 +431,12 @@ class Fields:
             entry.changed("scale", "digits behind the point are kept; Telegraf dropped them")
         if not was_float:
             key, kept = ("scale", kind) if output == "native" else ("output", output)
-            factor = int(scale) if is_whole else scale
-            ends = [factor * end for end in limits(_TYPES[kind])]
-            least, most = limits(_TYPES[kept])
-            if min(ends) < least or max(ends) > most:
+            if not _fits(kind, int(scale) if is_whole else scale, kept):
                 message = f"numbers beyond {kept} stay as they are; Telegraf had other ones"
                 entry.changed(key, message)
         settings = {"type": _TYPES[kind]}
         settings |= _order(_OF_ONE_REGISTER[order] if _SIZES[kind] == 1 else order)
-        becomes_float = is_float or kind == "UINT64" or not is_whole
+        becomes_float = is_float or not is_whole or not _fits(kind, int(scale), "INT64")
         return settings | ({} if scale == 1 else {"scale": scale}), was_float != becomes_float
 
     def _add(
@@ -469,6 +466,12 @@ class Fields:
             if measurement is not None and made.measured_at is None:
                 made.measurement, made.measured_at = measurement, path
         unit.fields.append(made)
+
+
+def _fits(kind: str, factor: float, kept: str) -> bool:
+    """Whether all integers of one type, times a factor, are within another type."""
+    least, most = limits(_TYPES[kept])
+    return all(least <= factor * end <= most for end in limits(_TYPES[kind]))
 
 
 def _order(order: str) -> dict[str, str]:
