@@ -1,4 +1,4 @@
-"""Whether a written value between two steps of the registers is rounded, and to which step."""
+"""How a written value between two steps of the registers is rounded by default, and to which step."""
 
 from __future__ import annotations
 
