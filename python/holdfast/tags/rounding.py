@@ -1,4 +1,4 @@
-"""How a written value between two steps of the registers is rounded by default, and to which step."""
+"""How a written value between two steps is rounded by default, and what the steps are."""
 
 from __future__ import annotations
 
