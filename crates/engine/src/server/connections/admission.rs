@@ -168,17 +168,20 @@ impl Admission {
 
     /// Ends the connections for which `ends` has a reason. The others look up their rights again,
     /// before they answer the next request. Returns the reasons, and whom they concern.
+    ///
+    /// Judges without the lock: that may take long, and workers need it for each connection that begins or ends.
     pub(crate) fn review<R>(&self, ends: impl Fn(&Peer) -> Option<R>) -> Vec<(Peer, R)> {
-        let mut table = lock(&self.table);
-        let mut ending = Vec::new();
-        for (id, held) in table.held() {
-            match ends(&held.peer) {
-                Some(reason) => ending.push((*id, reason)),
-                None => held.activity.is_outdated.store(true, Ordering::Release),
+        let copy = |(id, held): (&u64, &Held)| (*id, held.peer.clone(), Arc::clone(&held.activity));
+        let open: Vec<_> = lock(&self.table).held().map(copy).collect();
+        let judged = open.into_iter().filter_map(|(id, peer, activity)| match ends(&peer) {
+            // `None` if it has ended meanwhile.
+            Some(reason) => self.end(id).map(|peer| (peer, reason)),
+            None => {
+                activity.is_outdated.store(true, Ordering::Release);
+                None
             }
-        }
-        let ended = |(id, reason)| table.end(id).map(|held| (held.peer, reason));
-        ending.into_iter().filter_map(ended).collect()
+        });
+        judged.collect()
     }
 
     /// Ends all connections. From now on, none is admitted. Returns their peers.
@@ -426,6 +429,7 @@ impl Drop for Ticket {
 
 #[cfg(test)]
 pub(super) mod tests {
+    use std::cell::{Cell, RefCell};
     use std::time::Duration;
 
     use super::*;
@@ -518,6 +522,26 @@ pub(super) mod tests {
             assert_eq!(tickets[1].establish(), Ok(None), "it ends at the next await");
             assert!(admission.is_closed() && admission.open() == 0);
         }
+    }
+
+    #[test]
+    fn connections_begin_and_end_while_others_are_judged() {
+        let admission = admission(9, None, WhenFull::Refuse);
+        let tickets = [1, 2, 3].map(|port| admission.admit(peer(1, port)).unwrap().0);
+        let begun = Cell::new(None);
+        let left = RefCell::new(Some(tickets));
+        let ended = admission.review(|judged| {
+            assert!(admission.table.try_lock().is_ok(), "no worker waits for this");
+            if let Some([first, second, third]) = left.take() {
+                drop(first);
+                begun.set(Some((second, third, admission.admit(peer(1, 4)).unwrap().0)));
+            }
+            (judged.address.port() != 3).then_some(())
+        });
+        assert_eq!(ended, [(peer(1, 2).into(), ())], "the first has left, the last is new");
+        let (_second, third, _new) = begun.take().unwrap();
+        assert!(third.take_outdated());
+        assert_eq!(admission.open(), 2);
     }
 
     #[test]
