@@ -537,12 +537,11 @@ impl Listener {
         self.context.admission.set_limits(limits);
         let service = Arc::new(service);
         let before = live.replace(Arc::clone(&service));
-        self.context.review(&*before, &*service);
+        self.context.apply_reload(&*before, &*service);
     }
 
     fn review<S: Service>(&self, live: &Reloadable<S>) {
-        let service = live.get();
-        self.context.review(&*service, &*service);
+        self.context.review(&*live.get());
     }
 
     /// Stops listening and closes all connections.

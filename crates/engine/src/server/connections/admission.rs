@@ -166,18 +166,30 @@ impl Admission {
         Ok((Ticket { id, activity, admission: Arc::clone(self) }, evicted))
     }
 
-    /// Ends the connections for which `ends` has a reason. The others look up their rights again,
-    /// before they answer the next request. Returns the reasons, and whom they concern.
-    ///
-    /// Judges without the lock: that may take long, and workers need it for each connection that begins or ends.
+    /// Ends the connections for which `ends` has a reason. Returns the reasons, and whom they concern.
     pub(crate) fn review<R>(&self, ends: impl Fn(&Peer) -> Option<R>) -> Vec<(Peer, R)> {
+        self.judge(ends, |_| ())
+    }
+
+    /// The same after a reload: the others look up their rights again, before they answer the next request.
+    pub(crate) fn apply_reload<R>(&self, ends: impl Fn(&Peer) -> Option<R>) -> Vec<(Peer, R)> {
+        self.judge(ends, |activity| activity.is_outdated.store(true, Ordering::Release))
+    }
+
+    /// Ends connections. The others stay. Judges without the lock: that may take long, and workers need it for each
+    /// connection that begins or ends.
+    fn judge<R>(
+        &self,
+        ends: impl Fn(&Peer) -> Option<R>,
+        stays: impl Fn(&Activity),
+    ) -> Vec<(Peer, R)> {
         let copy = |(id, held): (&u64, &Held)| (*id, held.peer.clone(), Arc::clone(&held.activity));
         let open: Vec<_> = lock(&self.table).held().map(copy).collect();
         let judged = open.into_iter().filter_map(|(id, peer, activity)| match ends(&peer) {
             // `None` if it has ended meanwhile.
             Some(reason) => self.end(id).map(|peer| (peer, reason)),
             None => {
-                activity.is_outdated.store(true, Ordering::Release);
+                stays(&activity);
                 None
             }
         });
@@ -530,7 +542,7 @@ pub(super) mod tests {
         let tickets = [1, 2, 3].map(|port| admission.admit(peer(1, port)).unwrap().0);
         let begun = Cell::new(None);
         let left = RefCell::new(Some(tickets));
-        let ended = admission.review(|judged| {
+        let ended = admission.apply_reload(|judged| {
             assert!(admission.table.try_lock().is_ok(), "no worker waits for this");
             if let Some([first, second, third]) = left.take() {
                 drop(first);

@@ -928,7 +928,7 @@ mod tests {
         connection.renewal = Arc::new(WithoutLimit(Arc::clone(&connection.answering.rights)));
         connection.deadlines.timeouts.idle = Some(Duration::ZERO);
         assert_eq!(connection.on_alarm(), Err(Kind::Idle));
-        admission.review(|_| None::<Kind>);
+        admission.apply_reload(|_| None::<Kind>);
         assert_eq!(connection.on_alarm(), Ok(()));
     }
 

@@ -132,9 +132,17 @@ impl ListenerContext {
         self.reporter.report(&self.name, kind, peer, subject);
     }
 
-    /// Ends the connections that a service does not serve any more in the place of `before`.
-    pub(crate) fn review<S: Service>(&self, before: &S, service: &S) {
-        for (peer, kind) in self.admission.review(|peer| service.ends(before, peer)) {
+    /// Ends the connections whose certificates a service does not trust any more.
+    pub(crate) fn review<S: Service>(&self, service: &S) {
+        for (peer, kind) in self.admission.review(|peer| service.ends(service, peer)) {
+            self.ended(kind, peer);
+        }
+    }
+
+    /// Ends the connections that a service does not serve any more in the place of `before`. The others look up
+    /// their rights again.
+    pub(crate) fn apply_reload<S: Service>(&self, before: &S, service: &S) {
+        for (peer, kind) in self.admission.apply_reload(|peer| service.ends(before, peer)) {
             self.ended(kind, peer);
         }
     }

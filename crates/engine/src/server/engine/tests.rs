@@ -210,6 +210,29 @@ fn the_only_packet_of_a_connection_is_judged_by_the_rights_after_a_reload() {
 }
 
 #[test]
+fn a_refusal_is_reported_again_after_a_reload_and_not_after_a_review() {
+    let memory = memory();
+    let kind = || ListenerKind::ModbusStream(stream(&memory, None));
+    let events = Verbosity::Refusals;
+    let listening = || listening(vec![("plant", kind())]);
+    let settings = Settings { listening: listening(), workers: 1, events, audit: None };
+    let engine = Engine::start(settings).unwrap();
+    let mut client = served(&engine);
+    // Unit 2 has no memory. The exception follows the event.
+    let mut refused = || {
+        client.write_all(&[0, 1, 0, 0, 0, 6, 2, 3, 0, 0, 0, 1]).unwrap();
+        client.read_exact(&mut [0; 9]).unwrap();
+        let events = std::iter::from_fn(|| engine.next_event(Duration::ZERO));
+        events.filter(|event| matches!(event.kind, Kind::RefusedRequest(_))).count()
+    };
+    assert_eq!((refused(), refused()), (1, 0));
+    engine.review();
+    assert_eq!(refused(), 0);
+    engine.reload(listening()).unwrap();
+    assert_eq!((refused(), refused()), (1, 0));
+}
+
+#[test]
 fn a_port_that_carries_packets_no_more_ends_a_connection_that_sends_one() {
     let memory = memory();
     let kind = |raw| ListenerKind::ModbusStream(stream(&memory, raw));
