@@ -42,6 +42,22 @@ struct Stored {
     in_order: VecDeque<Vec<u8>>,
 }
 
+impl Stored {
+    /// Forgets sessions until there are not too many.
+    fn limit(&mut self) {
+        let Stored { sessions, in_order } = self;
+        while sessions.len() > MAX_SESSIONS
+            && let Some(oldest) = in_order.pop_front()
+        {
+            sessions.remove(&oldest);
+        }
+        // A session that is resumed gets another key each time: the keys before it must not pile up.
+        if in_order.len() > 2 * MAX_SESSIONS {
+            in_order.retain(|key| sessions.contains_key(key));
+        }
+    }
+}
+
 #[derive(Clone)]
 struct Session {
     secrets: Vec<u8>,
@@ -99,11 +115,7 @@ impl StoresServerSessions for Sessions {
         let mut stored = lock(&self.stored);
         stored.in_order.push_back(key.clone());
         stored.sessions.insert(key, Session { secrets, chain, proved });
-        if stored.in_order.len() > MAX_SESSIONS
-            && let Some(oldest) = stored.in_order.pop_front()
-        {
-            stored.sessions.remove(&oldest);
-        }
+        stored.limit();
         true
     }
 
@@ -140,6 +152,29 @@ impl Sessions {
             assert!(self.put(number.to_be_bytes().to_vec(), Vec::new()));
         }
         assert_eq!(lock(&self.stored).sessions.len(), MAX_SESSIONS);
+        noted(std::mem::take);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rustls::time_provider::DefaultTimeProvider;
+
+    use super::*;
+
+    #[test]
+    fn a_client_that_resumes_often_displaces_no_other() {
+        let sessions = Sessions::new(None, Arc::new(DefaultTimeProvider));
+        let key = |number: usize| number.to_be_bytes().to_vec();
+        assert!(sessions.put(key(0), b"other".to_vec()));
+        for number in 1..4 * MAX_SESSIONS {
+            assert!(sessions.put(key(number), Vec::new()));
+            assert!(sessions.take(&key(number)).is_some());
+        }
+        assert_eq!(sessions.get(&key(0)).as_deref(), Some(&b"other"[..]));
+        let stored = lock(&sessions.stored);
+        assert!(stored.sessions.len() == 1 && stored.in_order.len() <= 2 * MAX_SESSIONS);
+        drop(stored);
         noted(std::mem::take);
     }
 }
