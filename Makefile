@@ -100,6 +100,8 @@ lint: no-std .venv/core.stamp .venv/dev.stamp
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets -- -D warnings
 	cargo clippy --locked --quiet $(PROTOCOL) --all-targets --no-default-features -- -D warnings
 	RUSTDOCFLAGS='-D warnings' cargo doc --locked --quiet --no-deps $(PROTOCOL)
+	RUSTDOCFLAGS='-D warnings -A rustdoc::private-intra-doc-links' cargo doc --locked --quiet --no-deps --workspace \
+	  --document-private-items
 	cargo publish --locked --quiet --dry-run --allow-dirty $(PROTOCOL)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check

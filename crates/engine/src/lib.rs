@@ -3,9 +3,9 @@
 //! The rules this crate keeps:
 //!
 //! * The rights of a connection are fixed when it is accepted: its source address selects one rule
-//!   ([`server::policy`]), compiled to two tables. A request costs two look-ups.
+//!   ([`server::rights::policy`]), compiled to two tables. A request costs two look-ups.
 //! * Requests that arrive together are answered together, in order, with one write
-//!   (`server::connection`). The path from request to reply ([`server::unit_server`]) does not
+//!   (`server::connections::connection`). The path from request to reply ([`server::requests::unit_server`]) does not
 //!   allocate.
 //! * One peer cannot delay another: every buffer has a limit, every wait has a deadline, and code
 //!   on a worker thread waits for nothing but its sockets.

@@ -1,4 +1,4 @@
-//! Keeps memories: in a file of this machine ([`file`]), or in a log that several machines share
+//! Keeps memories: in a file of this machine ([`mod@file`]), or in a log that several machines share
 //! ([`log`]). Both are [`Journal`](holdfast_memory::Journal)s: they carry out the writes to a memory.
 
 #![forbid(unsafe_code)]

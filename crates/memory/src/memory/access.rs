@@ -46,7 +46,7 @@ impl Memory {
     /// seal is ignored. The ranges must have been checked by `holds`.
     ///
     /// # Errors
-    /// Those of [`Journal::admit`], then `Stale`.
+    /// Those of [`Journal::admit`](crate::Journal::admit), then `Stale`.
     pub(crate) fn read_since(
         &self,
         seen: Option<u64>,
