@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use holdfast_engine::poller::MirrorAge as Core;
-use holdfast_runtime::time_since_boot;
+use holdfast_runtime::suspend_aware_time;
 use pyo3::prelude::*;
 
 use crate::arguments::seconds;
@@ -18,7 +18,7 @@ impl MirrorAge {
     #[new]
     #[pyo3(signature = (after, *, refuses, lease=None))]
     fn new(after: f64, refuses: bool, lease: Option<u64>) -> PyResult<MirrorAge> {
-        let core = Core::new(time_since_boot, seconds("after", after)?, refuses, lease);
+        let core = Core::new(suspend_aware_time, seconds("after", after)?, refuses, lease);
         Ok(MirrorAge { core: Arc::new(core) })
     }
 

@@ -8,11 +8,11 @@ pub struct Epoch(Duration);
 
 impl Epoch {
     pub fn now() -> Epoch {
-        Epoch(time_since_boot())
+        Epoch(suspend_aware_time())
     }
 
     pub fn elapsed(self) -> Duration {
-        time_since_boot().saturating_sub(self.0)
+        suspend_aware_time().saturating_sub(self.0)
     }
 
     /// The moment this long after it, for what waits. It is now if that has passed.
@@ -23,9 +23,10 @@ impl Epoch {
     }
 }
 
-/// The time since the machine was started. [`Instant`] stands still during a suspend on Linux and macOS.
+/// The time since some moment, which stays the same while the process runs: only differences mean something. It goes on
+/// during a suspend. [`Instant`] stands still then on Linux and macOS.
 #[cfg(any(target_os = "linux", target_os = "android", target_vendor = "apple"))]
-pub fn time_since_boot() -> Duration {
+pub fn suspend_aware_time() -> Duration {
     use rustix::time::{ClockId, clock_gettime};
     #[cfg(target_vendor = "apple")]
     let now = clock_gettime(ClockId::Monotonic);
@@ -35,12 +36,13 @@ pub fn time_since_boot() -> Duration {
     Duration::new(seconds, u32::try_from(now.tv_nsec).unwrap_or_default())
 }
 
-/// The time since the process began. On Windows, [`Instant`] goes on during a suspend.
+/// The time since some moment, which stays the same while the process runs: only differences mean something. It goes on
+/// during a suspend, as [`Instant`] does on Windows.
 #[cfg(not(any(target_os = "linux", target_os = "android", target_vendor = "apple")))]
-pub fn time_since_boot() -> Duration {
+pub fn suspend_aware_time() -> Duration {
     use std::sync::LazyLock;
-    static BEGAN: LazyLock<Instant> = LazyLock::new(Instant::now);
-    BEGAN.elapsed()
+    static FIRST_CALL: LazyLock<Instant> = LazyLock::new(Instant::now);
+    FIRST_CALL.elapsed()
 }
 
 #[cfg(test)]
@@ -59,12 +61,12 @@ mod tests {
 
     #[test]
     #[cfg(target_os = "linux")]
-    fn the_clock_counts_the_time_since_the_machine_was_started() {
+    fn on_linux_the_clock_counts_the_time_since_the_machine_was_started() {
         let uptime = || {
             let text = std::fs::read_to_string("/proc/uptime").unwrap();
             Duration::from_secs_f64(text.split(' ').next().unwrap().parse().unwrap())
         };
-        let (before, now, after) = (uptime(), time_since_boot(), uptime());
+        let (before, now, after) = (uptime(), suspend_aware_time(), uptime());
         let hundredth = Duration::from_millis(10);
         assert!(before <= now && now <= after + hundredth, "{before:?} {now:?} {after:?}");
     }

@@ -10,7 +10,7 @@ mod lock;
 mod own_threads;
 
 pub use backoff::Retry;
-pub use clock::{Epoch, time_since_boot};
+pub use clock::{Epoch, suspend_aware_time};
 pub use counter::Counter;
 pub use lock::lock;
 pub use own_threads::OwnThreads;

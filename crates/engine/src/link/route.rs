@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use holdfast_protocol::client::Tolerance;
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, Function};
-use holdfast_runtime::{Retry, lock, time_since_boot};
+use holdfast_runtime::{Retry, lock, suspend_aware_time};
 use tokio::sync::mpsc;
 
 use super::caller::{Caller, Waiting};
@@ -104,7 +104,7 @@ pub struct SharedLink {
 pub(crate) struct Call {
     pub(super) unit_id: u8,
     pub(super) request: EncodedRequest,
-    /// When it came, by [`time_since_boot`].
+    /// When it came, by [`suspend_aware_time`].
     pub(super) queued: Duration,
     pub(super) source: u64,
     pub(super) priority: Priority,
@@ -245,7 +245,7 @@ impl SharedLink {
         let (ticket, waiting) = caller.begin(request, timeout, is_broadcast);
         let longest_wait = self.longest_wait();
         let to = Receiver::EventLoop(waiting.at_most(longest_wait));
-        let (request, queued, source) = (request.clone(), time_since_boot(), caller.source);
+        let (request, queued, source) = (request.clone(), suspend_aware_time(), caller.source);
         let reply =
             Reply { to, longest_wait, peers, in_order: None, withdrawal: None, _place: place };
         // If the link has ended, the call ends as lost.
@@ -291,7 +291,7 @@ impl Route {
         let call = Call {
             unit_id,
             request,
-            queued: time_since_boot(),
+            queued: suspend_aware_time(),
             source: asker.source,
             priority,
             reply: Reply {

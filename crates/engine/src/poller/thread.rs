@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use holdfast_memory::Memory;
 use holdfast_protocol::pdu::EncodedRequest;
-use holdfast_runtime::{OwnThreads, lock, time_since_boot};
+use holdfast_runtime::{OwnThreads, lock, suspend_aware_time};
 use tokio::runtime::Builder;
 use tokio::sync::mpsc;
 use tokio::task::{LocalSet, spawn_local};
@@ -69,7 +69,7 @@ enum Command {
         device: String,
         ticket: u64,
         request: Box<EncodedRequest>,
-        /// When it came, by [`time_since_boot`].
+        /// When it came, by [`suspend_aware_time`].
         queued: Duration,
         until: Option<Instant>,
         to: Arc<Results>,
@@ -283,7 +283,7 @@ impl Poller {
             return Err(PollerError::Unknown { device: name.to_owned() });
         }
         let ticket = self.tickets.fetch_add(1, Ordering::Relaxed);
-        let (device, queued, to) = (name.to_owned(), time_since_boot(), Arc::clone(to));
+        let (device, queued, to) = (name.to_owned(), suspend_aware_time(), Arc::clone(to));
         self.send(Command::Write { device, ticket, request, queued, until, to })?;
         Ok(ticket)
     }

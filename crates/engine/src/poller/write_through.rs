@@ -11,7 +11,7 @@ use std::time::Duration;
 
 use holdfast_memory::{Access, Area, Memory, Outcome, Refusal, Write};
 use holdfast_protocol::pdu::{EncodedRequest, ExceptionCode, Function, Range, Request};
-use holdfast_runtime::time_since_boot;
+use holdfast_runtime::suspend_aware_time;
 use tokio::sync::{mpsc, oneshot};
 
 use super::destination::ReadSettings;
@@ -60,7 +60,7 @@ pub(super) struct PassedWrite {
     pdu: Vec<u8>,
     /// As the device gets it.
     request: EncodedRequest,
-    /// When it came, by [`time_since_boot`].
+    /// When it came, by [`suspend_aware_time`].
     queued: Duration,
     reply: Receiver,
     _place: Place,
@@ -173,7 +173,7 @@ impl Passage {
             written,
             request: translated(pdu, range, read.is_some())?,
             pdu: pdu.to_vec(),
-            queued: time_since_boot(),
+            queued: suspend_aware_time(),
             reply,
             _place: place,
         };

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use holdfast_runtime::time_since_boot;
+use holdfast_runtime::suspend_aware_time;
 
 #[derive(Debug, Clone, Default)]
 pub(super) enum Clock {
@@ -20,7 +20,7 @@ pub(super) struct Moment(u64);
 impl Clock {
     pub(super) fn now(&self) -> Moment {
         let now = match self {
-            Clock::Machine => time_since_boot(),
+            Clock::Machine => suspend_aware_time(),
             #[cfg(test)]
             Clock::Test(now) => *now.lock().unwrap(),
         };

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use holdfast_protocol::client::MAX_READ_DELAY;
-use holdfast_runtime::{lock, time_since_boot};
+use holdfast_runtime::{lock, suspend_aware_time};
 use tokio::time::{MissedTickBehavior, interval};
 
 use super::permit::Wanted;
@@ -15,7 +15,7 @@ use super::permit::Wanted;
 const LOOK_INTERVAL: Duration = Duration::from_millis(250);
 
 thread_local! {
-    static OWN: Arc<Standstills> = Arc::new(Standstills::from(time_since_boot()));
+    static OWN: Arc<Standstills> = Arc::new(Standstills::from(suspend_aware_time()));
 }
 
 /// Detects standstills of this thread, for ever.
@@ -25,15 +25,15 @@ pub(crate) async fn watch() {
     ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
     loop {
         ticks.tick().await;
-        own.look(time_since_boot());
+        own.look(suspend_aware_time());
     }
 }
 
-/// Whether this thread, which must [`watch`], has run since a write was `queued`, by [`time_since_boot`]. A device that
+/// Whether this thread, which must [`watch`], has run since a write was `queued`, by [`suspend_aware_time`]. A device that
 /// is slow holds up no thread.
 pub(crate) fn none_since(queued: Duration) -> Wanted {
     let own = OWN.with(Arc::clone);
-    Arc::new(move |_| !own.held_up(queued, time_since_boot()))
+    Arc::new(move |_| !own.held_up(queued, suspend_aware_time()))
 }
 
 #[derive(Debug)]

@@ -7,7 +7,7 @@ use std::rc::Rc;
 use std::time::Duration;
 
 use holdfast_protocol::pdu::EncodedRequest;
-use holdfast_runtime::time_since_boot;
+use holdfast_runtime::suspend_aware_time;
 use tokio::sync::Notify;
 
 use crate::client::Peers;
@@ -78,7 +78,7 @@ impl SharedReads {
         }
         let cached = self.cached.borrow();
         let found = cached.get(read)?;
-        let holds = found.changes == changes && time_since_boot() < found.until;
+        let holds = found.changes == changes && suspend_aware_time() < found.until;
         holds.then(|| found.pdu.clone())
     }
 
@@ -87,7 +87,7 @@ impl SharedReads {
         if self.keep.is_zero() {
             return;
         }
-        let now = time_since_boot();
+        let now = suspend_aware_time();
         let mut cached = self.cached.borrow_mut();
         if cached.len() >= MAX_CACHED_READS {
             cached.retain(|_, kept| now < kept.until);
