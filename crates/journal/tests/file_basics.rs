@@ -68,7 +68,7 @@ impl Freshness for Ages {
         self.0.lock().unwrap().push(age);
     }
 
-    fn is_stale(&self) -> bool {
+    fn must_refuse(&self) -> bool {
         false
     }
 }

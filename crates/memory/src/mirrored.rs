@@ -15,7 +15,7 @@ pub trait Freshness: fmt::Debug + Send + Sync {
     fn renew(&self, age: Duration, lease: Option<u64>);
 
     /// Whether only the mirror may read or write the range now.
-    fn is_stale(&self) -> bool;
+    fn must_refuse(&self) -> bool;
 }
 
 /// Items that [`Access::Mirror`](crate::Access::Mirror) writes.
@@ -35,8 +35,8 @@ impl Mirrored {
         Mirrored { area, address, count, is_reserved: true, freshness: None }
     }
 
-    pub(crate) fn is_stale(&self) -> bool {
-        self.freshness.as_deref().is_some_and(Freshness::is_stale)
+    pub(crate) fn must_refuse(&self) -> bool {
+        self.freshness.as_deref().is_some_and(Freshness::must_refuse)
     }
 
     /// Whether a write covers all items.

@@ -21,29 +21,33 @@ pub struct MirrorAge {
     began: Duration,
     /// The number of the lease of the device, if several nodes share the memory.
     lease: Option<u64>,
-    /// The time of the last values, in nanoseconds; 0 if there are none yet.
-    renewed: AtomicU64,
-    /// In nanoseconds.
-    after: AtomicU64,
+    /// The time of the last values; 0 if there are none yet.
+    renewed_ns: AtomicU64,
+    stale_after_ns: AtomicU64,
     refuses: AtomicBool,
 }
 
 impl MirrorAge {
-    /// Values are stale `after` this time. Stale values are refused, or only shown as stale.
-    pub fn new(clock: Clock, after: Duration, refuses: bool, lease: Option<u64>) -> MirrorAge {
+    /// Values are stale after this time. Stale values are refused, or only shown as stale.
+    pub fn new(
+        clock: Clock,
+        stale_after: Duration,
+        refuses: bool,
+        lease: Option<u64>,
+    ) -> MirrorAge {
         MirrorAge {
             clock,
             began: clock(),
             lease,
-            renewed: AtomicU64::new(0),
-            after: AtomicU64::new(nanos(after)),
+            renewed_ns: AtomicU64::new(0),
+            stale_after_ns: AtomicU64::new(nanos(stale_after)),
             refuses: AtomicBool::new(refuses),
         }
     }
 
     /// Changes the settings. The age of the values stays.
-    pub fn set(&self, after: Duration, refuses: bool) {
-        self.after.store(nanos(after), Ordering::Relaxed);
+    pub fn set(&self, stale_after: Duration, refuses: bool) {
+        self.stale_after_ns.store(nanos(stale_after), Ordering::Relaxed);
         self.refuses.store(refuses, Ordering::Relaxed);
     }
 
@@ -55,21 +59,22 @@ impl MirrorAge {
     /// The range has values that its device has sent at this time of [`now`](MirrorAge::now), or later.
     pub(super) fn renew_since(&self, time: Duration) {
         // Values that are written later are no older, also if less is known of their age.
-        self.renewed.fetch_max(nanos(time).max(1), Ordering::Relaxed);
+        self.renewed_ns.fetch_max(nanos(time).max(1), Ordering::Relaxed);
     }
 
     /// The age of the last values, if there are any.
     pub fn age(&self) -> Option<Duration> {
-        let renewed = Some(self.renewed.load(Ordering::Relaxed)).filter(|renewed| *renewed > 0)?;
+        let renewed =
+            Some(self.renewed_ns.load(Ordering::Relaxed)).filter(|renewed| *renewed > 0)?;
         Some(self.now().saturating_sub(Duration::from_nanos(renewed)))
     }
 
     /// For how long the values have been stale; `None` if they are not.
     pub fn stale_for(&self) -> Option<Duration> {
-        let after = Duration::from_nanos(self.after.load(Ordering::Relaxed));
+        let stale_after = Duration::from_nanos(self.stale_after_ns.load(Ordering::Relaxed));
         match self.age() {
             None => Some(self.now().saturating_sub(self.began)),
-            Some(age) => age.checked_sub(after),
+            Some(age) => age.checked_sub(stale_after),
         }
     }
 }
@@ -82,7 +87,7 @@ impl Freshness for MirrorAge {
         }
     }
 
-    fn is_stale(&self) -> bool {
+    fn must_refuse(&self) -> bool {
         self.refuses.load(Ordering::Relaxed) && self.stale_for().is_some()
     }
 }
@@ -117,20 +122,20 @@ mod tests {
         let age = of(true);
         pass(3);
         assert_eq!((age.age(), age.stale_for()), (None, Some(Duration::from_secs(3))));
-        assert!(age.is_stale());
+        assert!(age.must_refuse());
         age.renew_since(age.now());
         assert_eq!((age.age(), age.stale_for()), (Some(Duration::ZERO), None));
         pass(9);
-        assert!(!age.is_stale());
+        assert!(!age.must_refuse());
         pass(1);
         assert_eq!(age.stale_for(), Some(Duration::ZERO));
-        assert!(age.is_stale());
+        assert!(age.must_refuse());
         age.set(Duration::from_secs(11), true);
-        assert!(!age.is_stale());
+        assert!(!age.must_refuse());
         pass(60);
-        assert!(age.is_stale());
+        assert!(age.must_refuse());
         age.renew_since(age.now());
-        assert!(!age.is_stale());
+        assert!(!age.must_refuse());
     }
 
     #[test]
@@ -138,9 +143,9 @@ mod tests {
         let age = of(true);
         pass(8);
         age.renew(Duration::from_secs(8), Some(LEASE));
-        assert_eq!((age.age(), age.is_stale()), (Some(Duration::from_secs(8)), false));
+        assert_eq!((age.age(), age.must_refuse()), (Some(Duration::from_secs(8)), false));
         pass(2);
-        assert!(age.is_stale());
+        assert!(age.must_refuse());
         age.renew_since(age.now() - Duration::from_secs(3));
         age.renew(Duration::from_secs(9), Some(LEASE));
         assert_eq!(age.age(), Some(Duration::from_secs(3)), "later values are no older");
@@ -150,19 +155,19 @@ mod tests {
     fn values_of_another_device_are_not_fresh() {
         let age = of(true);
         age.renew(Duration::ZERO, Some(LEASE + 1));
-        assert!(age.is_stale(), "another node reads another device into the range");
+        assert!(age.must_refuse(), "another node reads another device into the range");
         age.renew(Duration::ZERO, None);
-        assert!(age.is_stale(), "they may be of the device before this one");
+        assert!(age.must_refuse(), "they may be of the device before this one");
         age.renew(Duration::from_secs(4), Some(LEASE));
-        assert!(!age.is_stale(), "a node that follows knows only how old they are at most");
+        assert!(!age.must_refuse(), "a node that follows knows only how old they are at most");
     }
 
     #[test]
     fn values_that_are_kept_are_shown_as_stale_and_not_refused() {
         let age = of(false);
-        assert!(!age.is_stale());
+        assert!(!age.must_refuse());
         assert!(age.stale_for().is_some());
         age.set(Duration::from_secs(10), true);
-        assert!(age.is_stale());
+        assert!(age.must_refuse());
     }
 }

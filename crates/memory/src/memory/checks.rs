@@ -132,7 +132,7 @@ impl Memory {
         let mirrored = self.mirrored();
         if mirrored.touched(area, address, count).any(|range| range.is_reserved) {
             Err(Refusal::Mirrored)
-        } else if mirrored.touched(area, address, count).any(Mirrored::is_stale) {
+        } else if mirrored.touched(area, address, count).any(Mirrored::must_refuse) {
             Err(Refusal::Stale)
         } else {
             Ok(())
@@ -147,7 +147,7 @@ impl Memory {
         (area, address, count): (Area, u16, usize),
     ) -> Result<(), Refusal> {
         let ages = content.access_flags & AGING != 0 && access != Access::Mirror;
-        if ages && self.mirrored().touched(area, address, count).any(Mirrored::is_stale) {
+        if ages && self.mirrored().touched(area, address, count).any(Mirrored::must_refuse) {
             return Err(Refusal::Stale);
         }
         Ok(())

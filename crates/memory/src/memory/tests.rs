@@ -70,7 +70,7 @@ impl Freshness for Aged {
         self.0.store(age > Duration::ZERO, Ordering::Relaxed);
     }
 
-    fn is_stale(&self) -> bool {
+    fn must_refuse(&self) -> bool {
         self.0.load(Ordering::Relaxed)
     }
 }
@@ -205,13 +205,13 @@ fn a_step_makes_a_range_as_old_as_its_values_are() {
         let found = ages.map(|age| {
             let (memory, aged) = stale();
             step.carry_out_late(&[memory], age).unwrap();
-            aged.is_stale()
+            aged.must_refuse()
         });
         assert_eq!(found, [false, true, true]);
         let (memory, aged) = aging(false);
         aged.renew(Duration::ZERO, None);
         step.carry_out_late(&[Arc::new(memory)], None).unwrap();
-        assert!(!aged.is_stale(), "newer values are not older");
+        assert!(!aged.must_refuse(), "newer values are not older");
     }
 }
 
