@@ -80,11 +80,20 @@ struct Call<'r> {
     refused: Option<ClientError>,
 }
 
+/// When the question is asked whether a request may be sent.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SendMoment {
+    /// It waits, for a connection or for its turn.
+    Waiting,
+    /// It is sent now if the answer is yes: who answers notes that.
+    Sending,
+}
+
 /// What a call depends on.
 pub struct Conditions<'c> {
     /// Asked before a connection is made for the request, at least every 0.1 s while it waits until it can be
-    /// sent, and, with true, at the last moment before its first bytes are sent.
-    pub may_send: &'c dyn Fn(bool) -> Result<(), ClientError>,
+    /// sent, and at the last moment before its first bytes are sent.
+    pub may_send: &'c dyn Fn(SendMoment) -> Result<(), ClientError>,
     /// Asked before bytes are sent, and then at most every 0.1 s. If it is false, the connection is
     /// closed.
     pub may_continue: Option<&'c dyn Fn() -> bool>,
@@ -122,7 +131,7 @@ impl BlockingClient {
     pub fn interruptible_call<T>(
         &self,
         interrupted: &mut dyn FnMut() -> bool,
-        may_send: &dyn Fn(bool) -> Result<(), ClientError>,
+        may_send: &dyn Fn(SendMoment) -> Result<(), ClientError>,
         was_sent: &AtomicBool,
         (unit_id, request): (u8, &EncodedRequest),
         timeout: Duration,
@@ -178,7 +187,7 @@ impl BlockingClient {
         let mut take = Some(take);
         let mut deadline = Instant::now() + timeout;
         loop {
-            if let Err(error) = (conditions.may_send)(false) {
+            if let Err(error) = (conditions.may_send)(SendMoment::Waiting) {
                 if !conditions.may_continue() {
                     state.end();
                 }
@@ -486,7 +495,8 @@ impl Open {
             let outgoing = self.connection.outgoing();
             let is_sent = !outgoing.is_empty();
             // Also while it waits for late replies: the next request may have nothing to wait for.
-            if !has_begun && let Err(error) = (call.conditions.may_send)(is_sent) {
+            let moment = if is_sent { SendMoment::Sending } else { SendMoment::Waiting };
+            if !has_begun && let Err(error) = (call.conditions.may_send)(moment) {
                 call.refused = Some(error);
                 if !is_sent {
                     self.connection.cancel(ticket, self.epoch.elapsed());
@@ -642,9 +652,13 @@ mod tests {
             late: 0,
         });
         let asked = Cell::new(0);
-        let may_send = |is_sent: bool| {
+        let may_send = |moment: SendMoment| {
             asked.set(asked.get() + 1);
-            if is_sent || asked.get() > 3 { Err(ClientError::Expired) } else { Ok(()) }
+            if moment == SendMoment::Sending || asked.get() > 3 {
+                Err(ClientError::Expired)
+            } else {
+                Ok(())
+            }
         };
         let conditions = Conditions { may_send: &may_send, ..any_time() };
         let answer = client.call(&conditions, 1, &write, timeout, |_, _| ());
@@ -661,7 +675,10 @@ mod tests {
         let (host, port) = ("127.0.0.1".to_owned(), listener.local_addr().unwrap().port());
         let place = Place::Tcp { host, port, tls: None };
         let client = BlockingClient::new(Endpoint { place, tolerance: Tolerance::default() });
-        let may_send = |is_sent| if is_sent { Err(ClientError::Expired) } else { Ok(()) };
+        let may_send = |moment| match moment {
+            SendMoment::Sending => Err(ClientError::Expired),
+            SendMoment::Waiting => Ok(()),
+        };
         let conditions = Conditions { may_send: &may_send, ..any_time() };
         let write = EncodedRequest::new(&Request::WriteSingleRegister { address: 0, value: 1 });
         let answer = client.call(&conditions, 1, &write, Duration::from_secs(60), |_, _| ());

@@ -14,7 +14,7 @@ mod stray_counts;
 mod tls_stream;
 mod trace;
 
-pub use blocking::{BlockingClient, Conditions};
+pub use blocking::{BlockingClient, Conditions, SendMoment};
 pub use endpoint::{Endpoint, Place};
 pub use peers::Peers;
 pub use stray_counts::StrayCounters;

@@ -12,9 +12,9 @@ use holdfast_protocol::client::Closed;
 use holdfast_protocol::pdu::EncodedRequest;
 use holdfast_runtime::lock;
 
-use crate::client::{ClientError, Lost};
+use crate::client::{ClientError, Lost, SendMoment};
 use crate::link::limits::permit::Wanted;
-use crate::link::scheduling::queue::source;
+use crate::link::scheduling::queue::new_source;
 use crate::wake::{Wakes, pair};
 
 /// How long a link waits after a broadcast, which has no reply: the time to connect, if it is not
@@ -75,7 +75,7 @@ impl Caller {
     /// The system has no sockets left.
     pub fn new() -> io::Result<(Arc<Caller>, Wakes)> {
         let (wake, wakes) = pair()?;
-        let caller = Caller { source: source(), state: Mutex::default(), wake };
+        let caller = Caller { source: new_source(), state: Mutex::default(), wake };
         Ok((Arc::new(caller), wakes))
     }
 
@@ -163,9 +163,9 @@ impl Waiting {
     /// Whether it has not been given up, for a [`Permit`](crate::link::Permit). Notes that it is sent.
     pub(crate) fn wanted(&self) -> Wanted {
         let (caller, ticket) = (Arc::clone(&self.caller), self.ticket);
-        Arc::new(move |is_sent| match is_sent {
-            true => caller.note_sent(ticket),
-            false => lock(&caller.state).pending.contains_key(&ticket),
+        Arc::new(move |moment| match moment {
+            SendMoment::Sending => caller.note_sent(ticket),
+            SendMoment::Waiting => lock(&caller.state).pending.contains_key(&ticket),
         })
     }
 
@@ -217,7 +217,7 @@ mod tests {
         let calls: Vec<_> = (0..3).map(|_| caller.begin(&read(), TIMEOUT, false)).collect();
         assert_eq!(woken(&wakes), 0);
         for (_, waiting) in calls {
-            waiting.wanted()(true);
+            waiting.wanted()(SendMoment::Sending);
             waiting.end(Ok(vec![3, 2, 0, 7]));
         }
         assert_eq!(woken(&wakes), 1);
@@ -245,15 +245,15 @@ mod tests {
     fn a_call_that_was_sent_has_a_result_although_it_was_given_up() {
         let (caller, _wakes) = Caller::new().unwrap();
         let (ticket, waiting) = caller.begin(&read(), Duration::MAX, false);
-        assert!(waiting.wanted()(true));
+        assert!(waiting.wanted()(SendMoment::Sending));
         assert!(caller.withdraw(ticket), "it was sent");
         waiting.end(Ok(vec![3, 2, 0, 7]));
         assert_eq!(caller.take().len(), 1);
 
         let (ticket, waiting) = caller.begin(&read(), Duration::MAX, false);
-        assert!(waiting.wanted()(false), "there is no connection yet");
+        assert!(waiting.wanted()(SendMoment::Waiting), "there is no connection yet");
         assert!(!caller.withdraw(ticket));
-        assert!(!waiting.wanted()(true), "it is not sent");
+        assert!(!waiting.wanted()(SendMoment::Sending), "it is not sent");
 
         let (ticket, waiting) = caller.begin(&read(), Duration::MAX, false);
         waiting.end(Err(ClientError::Expired.into()));

@@ -14,6 +14,7 @@ use tokio::time::Instant;
 use super::fault::{Exchanged, Fault};
 use crate::client::{ClientError, Endpoint, Place, StrayCounters};
 use crate::link::limits::circuit_breaker::{CircuitBreakers, Down};
+use crate::link::limits::connect_pause::DuringPause;
 use crate::link::limits::permit::Permit;
 use crate::link::scheduling::in_flight::{Alone, InFlight, Pace, Place as Turn};
 use crate::link::scheduling::queue::Priority;
@@ -85,7 +86,9 @@ impl Link {
             // Its thread has closed the connection when it refuses this one.
             let (unit_id, request) = (0, EncodedRequest::new(&Request::ReadExceptionStatus));
             let unwanted = Permit { wanted: Some(Arc::new(|_| false)), ..Permit::default() };
-            let _ = link.exchange(unit_id, &request, Duration::ZERO, true, &unwanted).await;
+            let _ = link
+                .exchange(unit_id, &request, Duration::ZERO, DuringPause::Connect, &unwanted)
+                .await;
         }
     }
 
@@ -117,8 +120,11 @@ impl Link {
                 permit.in_time(turn).await.ok_or(ClientError::Expired)?
             }
         };
-        let eager = priority == Priority::Urgent;
-        self.exchange(unit_id, request, timeout, eager, permit).await
+        let during_pause = match priority {
+            Priority::Urgent => DuringPause::Connect,
+            _ => DuringPause::Fail,
+        };
+        self.exchange(unit_id, request, timeout, during_pause, permit).await
     }
 
     /// As [`call`](Link::call), for a read and then the write that `write` makes of its answer. No other
@@ -133,10 +139,10 @@ impl Link {
         permit: &Permit,
     ) -> Exchanged {
         let _alone = self.alone().await;
-        let answer = self.exchange(unit_id, read, timeout, true, permit).await?;
+        let answer = self.exchange(unit_id, read, timeout, DuringPause::Connect, permit).await?;
         let invalid = || ClientError::Invalid(InvalidResponse::Pdu(ResponseError::Length));
         let write = write(&answer).ok_or_else(invalid)?;
-        self.exchange(unit_id, &write, timeout, true, permit).await
+        self.exchange(unit_id, &write, timeout, DuringPause::Connect, permit).await
     }
 
     /// Waits for a turn, which lasts as long as the result.
@@ -153,22 +159,23 @@ impl Link {
         alone
     }
 
-    /// Sends a request and waits for the answer. With `eager`, an unreachable address is tried even
-    /// before its pause is over.
+    /// Sends a request and waits for the answer.
     pub(super) async fn exchange(
         &self,
         unit_id: u8,
         request: &EncodedRequest,
         timeout: Duration,
-        eager: bool,
+        during_pause: DuringPause,
         permit: &Permit,
     ) -> Exchanged {
         self.note_change(request);
         let answer = match &self.wire {
             Wire::Tcp(link) => {
-                link.exchange(&self.pace, unit_id, request, timeout, eager, permit).await
+                link.exchange(&self.pace, unit_id, request, timeout, during_pause, permit).await
             }
-            Wire::Blocking(link) => link.exchange(unit_id, request, timeout, eager, permit).await,
+            Wire::Blocking(link) => {
+                link.exchange(unit_id, request, timeout, during_pause, permit).await
+            }
         };
         self.note_change(request);
         answer

@@ -5,7 +5,8 @@
 //! can be in flight, if the settings allow it. Other transports carry one request at a time, in a
 //! thread of their own. Requests that wait for a place are served in a fair order ([`scheduling::queue`]).
 //!
-//! After a failed connect, requests fail immediately until a pause is over ([`limits::connect_pause`]).
+//! After a failed connect, polls fail immediately until a pause is over ([`limits::connect_pause`]), and requests of
+//! clients while a circuit breaker is open ([`limits::circuit_breaker`]).
 //! `Connection`, in `holdfast_protocol`, decides when a connection ends. The next request opens a new one.
 
 mod caller;
@@ -29,7 +30,7 @@ pub(crate) use route::{Asker, Call, Receiver};
 pub use route::{LinkCounters, LinkSettings, Route, SharedLink, Withdrawal};
 pub use scheduling::in_flight::InFlight;
 pub(crate) use scheduling::pending_reply::{PendingReply, Reply, ReplyTo, pending_reply};
-pub(crate) use scheduling::queue::{Priority, source};
+pub(crate) use scheduling::queue::{Priority, new_source};
 pub(crate) use scheduling::request_loop::serve;
 pub(crate) use sockets::connect::dial;
 pub(crate) use sockets::handshake::agree;

@@ -358,7 +358,7 @@ impl Reply {
         let wanted = self.to.wanted();
         match self.withdrawal.clone() {
             Some(withdrawal) => {
-                Arc::new(move |is_sent| !withdrawal.is_withdrawn() && wanted(is_sent))
+                Arc::new(move |moment| !withdrawal.is_withdrawn() && wanted(moment))
             }
             None => wanted,
         }

@@ -28,7 +28,7 @@ use super::cost::Samples;
 use super::destination::{Destination, ReadSettings, WriteOutcomes, mirrors};
 use super::forwarding::{Forward, ForwardSettings};
 use super::panic_guard::{Panicked, catch};
-use super::plan::{self, Block, Field, PlanError, PlanLimits, Strategy};
+use super::plan::{self, BITS_PER_REGISTER, Block, Field, PlanError, PlanLimits, Strategy};
 use super::poll_pause::PollPause;
 use super::remembered_refusals::{Learned, Unreadable};
 use super::results::{BlockResult, Poll, Results};
@@ -141,7 +141,8 @@ enum Message {
 }
 
 impl Inbox {
-    pub(super) fn succeed(&self, successor: Device) {
+    /// A new device takes the place of this one.
+    pub(super) fn replace_with(&self, successor: Device) {
         let earlier = self.successor.take();
         if earlier.is_some_and(|earlier| earlier.schedule.is_wanted_soon()) {
             successor.want_soon();
@@ -202,7 +203,7 @@ impl Planned {
 fn parted(reads: &[ReadSettings], limits: &PlanLimits) -> (Vec<Field>, Vec<(usize, u32)>) {
     let (mut fields, mut parts) = (Vec::new(), Vec::new());
     for (index, read) in reads.iter().enumerate() {
-        let most = if read.area.is_bits() { limits.max_bits } else { limits.max_registers };
+        let most = limits.most(read.area);
         let mut at = 0;
         while at < read.count {
             // The plan reports a limit of 0.
@@ -261,7 +262,7 @@ impl Device {
             .await;
             self = match polled {
                 Ok(mut successor) => {
-                    successor.follow(self);
+                    successor.take_over(self);
                     *successor
                 }
                 // Its state may be inconsistent: the new device starts from scratch.
@@ -349,7 +350,7 @@ impl Device {
             self.state.set_standby(true);
             self.forwards.iter().for_each(|forward| forward.withdraw());
             // Behind the last poll, so that its receiver forgets what that has read.
-            self.hand_over(Instant::now(), Gathered::default());
+            self.report_poll(Instant::now(), Gathered::default());
             self.publish_status();
             loop {
                 tokio::select! {
@@ -396,14 +397,14 @@ impl Device {
     }
 
     /// Takes over the state of the device before it.
-    fn follow(&mut self, before: Device) {
+    fn take_over(&mut self, before: Device) {
         self.keep_outcomes(&before);
         let (old, new) = (&before.settings, &self.settings);
         if before.has_other_source(self) {
             return self.schedule.begin_now();
         }
         let is_delaying = before.poll_pause.is_delaying();
-        self.schedule.follow(&before.schedule, is_delaying);
+        self.schedule.take_over(&before.schedule, is_delaying);
         if before.is_moved(self) && !is_delaying {
             self.schedule.begin_now();
         }
@@ -535,7 +536,7 @@ impl Device {
             None => self.state.good(),
             Some(fault) => self.state.bad(fault),
         }
-        self.hand_over(due, gathered);
+        self.report_poll(due, gathered);
     }
 
     /// A poll without a plan: nothing is sent, and every field gets the fault.
@@ -545,11 +546,11 @@ impl Device {
             gathered.note(*field, Err(Fault::Unplanned));
         }
         self.state.bad(Fault::Unplanned);
-        self.hand_over(due, gathered);
+        self.report_poll(due, gathered);
     }
 
     /// Sends the blocks of a poll to the results. Called after the health of the poll is stored.
-    fn hand_over(&self, due: Instant, gathered: Gathered) {
+    fn report_poll(&self, due: Instant, gathered: Gathered) {
         if let Some(results) = &self.settings.report {
             let (device, blocks) = (Arc::clone(&self.reported_as), gathered.blocks);
             results.push(Poll { device, due: results.counted(due.into_std()), blocks });
@@ -651,8 +652,8 @@ impl Device {
                 let took = began.elapsed();
                 self.state.answered(took);
                 let mut samples = self.samples.get();
-                let bits = if area.is_bits() { 16.0 } else { 1.0 };
-                samples.add(f64::from(quantity) / bits, took.as_secs_f64() * 1e3);
+                let per_item = if area.is_bits() { BITS_PER_REGISTER } else { 1.0 };
+                samples.add(f64::from(quantity) / per_item, took.as_secs_f64() * 1e3);
                 self.samples.set(samples);
             }
             Err(Fault::Exception(_)) => counters.exceptions.add(),
@@ -672,17 +673,17 @@ impl Device {
             let whole = settings.count == u32::from(field.count);
             if whole && !field.area.is_bits() {
                 let end = offset + usize::from(field.count);
-                self.hand_on(read, &bytes[offset * 2..end * 2], settings.now());
+                self.deliver_read(read, &bytes[offset * 2..end * 2], settings.now());
             } else if let Some(Partial { bytes, since, .. }) =
                 gathered.put(&self.turn, (read, settings), at, field, (bytes, offset))
             {
-                self.hand_on(read, &bytes, since);
+                self.deliver_read(read, &bytes, since);
             }
         }
     }
 
     /// `since` is when the values arrived, as [`ReadSettings::now`].
-    fn hand_on(&self, index: usize, bytes: &[u8], since: Option<Duration>) {
+    fn deliver_read(&self, index: usize, bytes: &[u8], since: Option<Duration>) {
         let read = &self.settings.reads[index];
         let (mut area, mut address) = (read.area, read.address);
         if let (Some(into), Some(outcomes)) = (&read.into, &self.outcomes[index]) {

@@ -12,7 +12,7 @@ use holdfast_protocol::pdu::limit;
 use thiserror::Error;
 
 /// Bits that count as one register.
-const BITS_PER_REGISTER: f64 = 16.0;
+pub(super) const BITS_PER_REGISTER: f64 = 16.0;
 
 /// A range that is read as a whole.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -131,7 +131,8 @@ impl Default for PlanLimits {
 }
 
 impl PlanLimits {
-    fn most(&self, area: Area) -> u16 {
+    /// The most items of one request.
+    pub(super) fn most(&self, area: Area) -> u16 {
         if area.is_bits() { self.max_bits } else { self.max_registers }
     }
 
@@ -140,19 +141,21 @@ impl PlanLimits {
     fn joins(&self, area: Area, end: u32, start: u32) -> bool {
         let between = |cut: &Cut| cut.area == area && end <= cut.address && cut.address <= start;
         start < end
-            || (!self.cuts.iter().any(between) && (start == end || self.bears(area, end, start)))
+            || (!self.cuts.iter().any(between)
+                && (start == end || self.may_read_gap(area, end, start)))
     }
 
     /// Whether a gap may be read.
-    fn bears(&self, area: Area, start: u32, end: u32) -> bool {
-        let of_area = |stretches: &[Stretch]| {
-            stretches.iter().filter(|each| each.area == area).copied().collect::<Vec<_>>()
-        };
-        let readable = of_area(&self.readable);
-        let inside = |each: &Stretch| each.start <= start && end <= each.end;
-        let apart = |each: &Stretch| end <= each.start || each.end <= start;
-        (readable.is_empty() || readable.iter().any(inside))
-            && of_area(&self.forbidden).iter().all(apart)
+    fn may_read_gap(&self, area: Area, start: u32, end: u32) -> bool {
+        let mut readable = self.readable.iter().filter(|each| each.area == area).peekable();
+        let is_inside = |each: &Stretch| each.start <= start && end <= each.end;
+        (readable.peek().is_none() || readable.any(is_inside))
+            && !self.is_forbidden(area, start, end)
+    }
+
+    /// Whether a part of a range is never read.
+    fn is_forbidden(&self, area: Area, start: u32, end: u32) -> bool {
+        self.forbidden.iter().any(|each| each.area == area && start < each.end && each.start < end)
     }
 }
 
@@ -180,8 +183,7 @@ pub fn plan(
         } else if field.end() > 65_536 {
             return Err(PlanError::Beyond { index });
         }
-        let open = PlanLimits { readable: Vec::new(), ..limits.clone() };
-        if !open.bears(field.area, field.address.into(), field.end()) {
+        if limits.is_forbidden(field.area, field.address.into(), field.end()) {
             return Err(PlanError::Forbidden { index });
         }
     }

@@ -73,7 +73,7 @@ impl Schedule {
     }
 
     /// Goes on with the schedule of the device before. While that was left alone, this one is too.
-    pub(super) fn follow(&self, before: &Schedule, is_backing_off: bool) {
+    pub(super) fn take_over(&self, before: &Schedule, is_backing_off: bool) {
         self.last_off_schedule.set(before.last_off_schedule.get());
         if is_backing_off {
             self.off_schedule.set(None);
@@ -145,7 +145,7 @@ mod tests {
         {
             let successor = Schedule::new(interval);
             successor.want_soon();
-            successor.follow(&schedule, is_backing_off);
+            successor.take_over(&schedule, is_backing_off);
             assert_eq!(successor.next(), expected);
         }
     }

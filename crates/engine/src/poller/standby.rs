@@ -15,7 +15,7 @@ impl DeviceSettings {
     pub(super) fn must_stand_by(&self) -> bool {
         self.fence
             .as_deref()
-            .is_some_and(|fence| fence.stage() != Stage::Open || self.settled(fence).is_some())
+            .is_some_and(|fence| fence.stage() != Stage::Open || self.settles_at(fence).is_some())
     }
 
     /// Waits until the device may be polled.
@@ -23,7 +23,7 @@ impl DeviceSettings {
         let Some(fence) = &self.fence else { return };
         loop {
             fence.opened().await;
-            let Some(at) = self.settled(fence) else { return };
+            let Some(at) = self.settles_at(fence) else { return };
             tokio::select! {
                 () = fence.ended() => {}
                 () = sleep_until(at.into()) => {}
@@ -32,8 +32,8 @@ impl DeviceSettings {
     }
 
     /// When a device that accepts one connection may be connected to: that of a former holder may last.
-    fn settled(&self, fence: &Fence) -> Option<Instant> {
-        self.release.then(|| fence.settled(self.timeout)).flatten()
+    fn settles_at(&self, fence: &Fence) -> Option<Instant> {
+        self.release.then(|| fence.settles_at(self.timeout)).flatten()
     }
 
     /// Waits until no poll may begin.

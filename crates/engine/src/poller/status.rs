@@ -1,5 +1,6 @@
 //! The status block: 30 registers with health and counters of a device.
 
+use std::ops::Range;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -15,6 +16,16 @@ pub(super) const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 
 /// The size of the device name, in bytes.
 const NAME_BYTES: usize = 16;
+
+// The registers of a block, as in docs/devices.md. 11 to 19 are not used, and 0.
+const HEALTH_AT: usize = 0;
+const LAST_ERROR_AT: usize = 1;
+const SECONDS_IN_ERROR_AT: usize = 2;
+const NAME_AT: Range<usize> = 3..11;
+/// Two registers for each, the low word first.
+const COUNTERS_AT: Range<usize> = 20..28;
+const FAILURES_AT: usize = 28;
+const MOST_FAILURES_AT: usize = 29;
 
 /// Place and content of the block of a device: at `slot` × 30 of an area of registers.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -82,25 +93,25 @@ pub struct Status {
 impl Status {
     fn registers(&self, settings: &BlockSettings) -> [u16; STATUS_BLOCK_LEN as usize] {
         let mut block = [0; STATUS_BLOCK_LEN as usize];
-        block[0] = self.health.code();
+        block[HEALTH_AT] = self.health.code();
         if self.failures > 0 || settings.keep_last_error {
-            block[1] = self.last_error;
+            block[LAST_ERROR_AT] = self.last_error;
         }
-        block[2] = self.seconds_in_error;
+        block[SECONDS_IN_ERROR_AT] = self.seconds_in_error;
         let mut text = [0; NAME_BYTES];
         for (byte, character) in text.iter_mut().zip(settings.name.bytes()) {
             let is_shown = character.is_ascii_graphic() || character == b' ';
             *byte = if is_shown { character } else { b'?' };
         }
-        for (register, pair) in block[3..11].iter_mut().zip(text.as_chunks::<2>().0) {
+        for (register, pair) in block[NAME_AT].iter_mut().zip(text.as_chunks::<2>().0) {
             *register = u16::from_be_bytes(*pair);
         }
         let counters = [self.polls, self.good_polls, self.timeouts, self.transport_errors];
-        for (pair, counter) in block[20..28].as_chunks_mut::<2>().0.iter_mut().zip(counters) {
+        for (pair, counter) in block[COUNTERS_AT].as_chunks_mut::<2>().0.iter_mut().zip(counters) {
             *pair = [counter as u16, (counter >> 16) as u16];
         }
-        block[28] = self.failures;
-        block[29] = self.most_failures;
+        block[FAILURES_AT] = self.failures;
+        block[MOST_FAILURES_AT] = self.most_failures;
         block
     }
 

@@ -263,8 +263,8 @@ impl Poller {
     }
 
     /// Sends a write over the connection of a device. Returns a number, under which its result is
-    /// passed `to` a receiver. What can't be sent until a time, and one timeout of the device, waits through a
-    /// standstill, or is withdrawn by the receiver, fails with [`Fault::Expired`].
+    /// passed `to` a receiver. It fails with [`Fault::Expired`] if it was not sent by `until` plus one timeout of the
+    /// device, if the thread stood still while it waited, or if the receiver has withdrawn it.
     ///
     /// # Errors
     /// [`PollerError`] if there is no such device, or the request is not a write.
@@ -397,7 +397,7 @@ async fn run_commands(
                 fences.watch(planned.settings.fence.as_ref());
                 let name = planned.settings.name.clone();
                 let device = match before {
-                    Some(mut device) if !device.has_ended() => {
+                    Some(mut device) if !device.has_panicked() => {
                         device.replace(*planned, polled, link, at_once);
                         device
                     }

@@ -205,9 +205,9 @@ fn translated(
         let Some(bytes) = moved.get_mut(at..).and_then(<[u8]>::first_chunk_mut::<2>) else {
             return Err(ExceptionCode::IllegalDataValue);
         };
-        let there = u16::from_be_bytes(*bytes) - range.address;
-        let here = range.device_address.checked_add(there);
-        *bytes = here.ok_or(ExceptionCode::IllegalDataAddress)?.to_be_bytes();
+        let offset = u16::from_be_bytes(*bytes) - range.address;
+        let device_address = range.device_address.checked_add(offset);
+        *bytes = device_address.ok_or(ExceptionCode::IllegalDataAddress)?.to_be_bytes();
     }
     EncodedRequest::parse(&moved)
 }
@@ -327,7 +327,7 @@ impl PassedWrite {
         if let Ok(Request::ReadWriteMultipleRegisters { read, .. }) = Request::parse(&self.pdu)
             && let Some(bytes) = answer.get(2..)
         {
-            let (address, count) = (self.there(read.address()), read.quantity().into());
+            let (address, count) = (self.device_address_of(read.address()), read.quantity().into());
             let area = Area::HoldingRegisters;
             changes.push(Change { area, address, count, bytes: bytes.to_vec() });
         }
@@ -351,15 +351,15 @@ impl PassedWrite {
     /// Whether the range still is read from the device, to the same place.
     fn is_mirrored(&self, reads: &RefCell<Vec<ReadSettings>>) -> bool {
         let PassedRange { area, address, count, device_address, .. } = self.range;
-        let (address, there) = (u32::from(address), u32::from(device_address));
+        let (address, device_address) = (u32::from(address), u32::from(device_address));
         reads.borrow().iter().any(|read| {
             let first = u32::from(read.address);
-            let has_all = first <= there && there + count <= first + read.count;
+            let has_all = first <= device_address && device_address + count <= first + read.count;
             let into = read.into.as_ref().filter(|_| read.area == area && has_all);
             into.is_some_and(|into| {
                 Arc::ptr_eq(&into.memory, &self.memory)
                     && into.area == area
-                    && u32::from(into.address) + (there - first) == address
+                    && u32::from(into.address) + (device_address - first) == address
             })
         })
     }
@@ -380,7 +380,7 @@ impl PassedWrite {
     }
 
     /// The address of the device that belongs to one of the memory.
-    fn there(&self, address: u16) -> u16 {
+    fn device_address_of(&self, address: u16) -> u16 {
         address - self.range.address + self.range.device_address
     }
 

@@ -1,5 +1,6 @@
-//! The pause after a failed connect: until it is over, requests fail at once, with the same error. How long it is,
-//! and how it grows, is in `holdfast_runtime::Retry`.
+//! The pause after a failed connect: until it is over, polls fail at once, with the same error. Requests of clients
+//! are tried all the same, as far as a [circuit breaker](super::circuit_breaker) lets them through. How long the
+//! pause is, and how it grows, is in `holdfast_runtime::Retry`.
 
 use std::cell::{Cell, RefCell};
 use std::sync::Arc;
@@ -9,6 +10,13 @@ use tokio::time::Instant;
 
 use crate::client::ClientError;
 use crate::link::fault::FLOODED;
+
+/// What a request does whose address could not be reached, before the pause is over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::link) enum DuringPause {
+    Fail,
+    Connect,
+}
 
 pub(in crate::link) struct ConnectPause {
     retry: Retry,

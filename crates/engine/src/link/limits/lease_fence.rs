@@ -41,7 +41,7 @@ pub struct Fence {
     /// In nanoseconds after `zero`; 0 if it was never opened, or is closed.
     until: AtomicU64,
     /// When requests of a former holder arrive no more, not counting the timeout of the device.
-    settled: AtomicU64,
+    settles: AtomicU64,
     is_ending: AtomicBool,
     /// Polls, writes and connections.
     in_use: AtomicUsize,
@@ -60,7 +60,7 @@ impl Fence {
             term: Mutex::default(),
             zero: Instant::now(),
             until: AtomicU64::new(0),
-            settled: AtomicU64::new(0),
+            settles: AtomicU64::new(0),
             is_ending: AtomicBool::new(false),
             in_use: AtomicUsize::new(0),
             stage: watch::Sender::new(Stage::Closed),
@@ -70,8 +70,8 @@ impl Fence {
     /// Opens it for a term. What a former holder has sent may still arrive for `settle`, and the timeout of a
     /// device.
     pub fn open(&self, until: Instant, term: Term, settle: Duration) {
-        let settled = if settle.is_zero() { 0 } else { self.time(Instant::now() + settle) };
-        self.settled.store(settled, Ordering::Release);
+        let settles = if settle.is_zero() { 0 } else { self.time(Instant::now() + settle) };
+        self.settles.store(settles, Ordering::Release);
         *lock(&self.term) = term;
         self.is_ending.store(false, Ordering::Release);
         self.until.store(self.time(until), Ordering::Release);
@@ -142,17 +142,18 @@ impl Fence {
         self.in_use.load(Ordering::Acquire)
     }
 
-    /// When nothing of a former holder can arrive at a device with this timeout any more.
-    pub(crate) fn settled(&self, timeout: Duration) -> Option<Instant> {
-        let settled = self.settled.load(Ordering::Acquire);
-        let at = (settled > 0).then(|| self.zero + Duration::from_nanos(settled) + timeout);
+    /// From when on nothing of a former holder can arrive at a device with this timeout any more. `None` if that is
+    /// so now.
+    pub(crate) fn settles_at(&self, timeout: Duration) -> Option<Instant> {
+        let settles = self.settles.load(Ordering::Acquire);
+        let at = (settles > 0).then(|| self.zero + Duration::from_nanos(settles) + timeout);
         at.filter(|at| Instant::now() < *at)
     }
 
     /// Waits until nothing of a former holder can arrive any more; `None` if the device may not be used.
     pub(crate) async fn admit_write(self: &Arc<Fence>, timeout: Duration) -> Option<Pass> {
         while self.stage() == Stage::Open {
-            let Some(at) = self.settled(timeout) else { return Some(self.pass()) };
+            let Some(at) = self.settles_at(timeout) else { return Some(self.pass()) };
             tokio::select! {
                 () = self.ended() => {}
                 () = sleep_until(at.into()) => {}

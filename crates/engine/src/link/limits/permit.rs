@@ -5,11 +5,11 @@ use std::time::Instant;
 
 use tokio::time::timeout_at;
 
-use crate::client::{ClientError, Peers};
+use crate::client::{ClientError, Peers, SendMoment};
 use crate::link::limits::lease_fence::Fence;
 
-/// Whether somebody still waits for the answer to a request. Called with true when it is sent now.
-pub(crate) type Wanted = Arc<dyn Fn(bool) -> bool + Send + Sync>;
+/// Whether somebody still waits for the answer to a request.
+pub(crate) type Wanted = Arc<dyn Fn(SendMoment) -> bool + Send + Sync>;
 
 /// Until when a request may be sent. The default is without a limit.
 #[derive(Clone, Default)]
@@ -24,27 +24,25 @@ pub(crate) struct Permit {
 }
 
 impl Permit {
-    /// `is_sent`: whether the request is sent now.
-    ///
     /// # Errors
     /// [`ClientError::Fenced`] or [`ClientError::Expired`].
-    pub fn check(&self, is_sent: bool) -> Result<(), ClientError> {
+    pub fn check(&self, moment: SendMoment) -> Result<(), ClientError> {
         if self.fence.as_ref().is_some_and(|fence| !fence.allows()) {
             return Err(ClientError::Fenced);
         }
-        if self.is_expected(is_sent) { Ok(()) } else { Err(ClientError::Expired) }
+        if self.is_expected(moment) { Ok(()) } else { Err(ClientError::Expired) }
     }
 
     /// Whether its caller still expects it to be sent.
-    pub fn is_expected(&self, is_sent: bool) -> bool {
+    pub fn is_expected(&self, moment: SendMoment) -> bool {
         self.until.is_none_or(|until| Instant::now() < until)
-            && self.wanted.as_ref().is_none_or(|wanted| wanted(is_sent))
+            && self.wanted.as_ref().is_none_or(|wanted| wanted(moment))
     }
 
     /// This permit while `also` expects the request too.
     pub fn and(&self, also: Wanted) -> Permit {
         let wanted: Wanted = match self.wanted.clone() {
-            Some(wanted) => Arc::new(move |is_sent| wanted(is_sent) && also(is_sent)),
+            Some(wanted) => Arc::new(move |moment| wanted(moment) && also(moment)),
             None => also,
         };
         Permit { wanted: Some(wanted), ..self.clone() }

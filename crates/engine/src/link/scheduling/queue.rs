@@ -16,8 +16,8 @@ const RANKS: usize = 3;
 /// Numbers the sources of requests. 0 is the poller.
 static SOURCES: AtomicU64 = AtomicU64::new(1);
 
-/// A number of a new source of requests.
-pub(crate) fn source() -> u64 {
+/// The number of a new source of requests.
+pub(crate) fn new_source() -> u64 {
     SOURCES.fetch_add(1, Ordering::Relaxed)
 }
 

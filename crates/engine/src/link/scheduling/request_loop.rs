@@ -14,6 +14,7 @@ use tokio::time::Instant;
 use crate::client::ClientError;
 use crate::link::fault::{Exchanged, Fault, exception, exception_code, fault};
 use crate::link::limits::circuit_breaker::{Down, OPEN_AFTER_TIMEOUTS};
+use crate::link::limits::connect_pause::DuringPause;
 use crate::link::limits::permit::{Permit, Wanted};
 use crate::link::limits::standstill;
 use crate::link::local_link::Link;
@@ -107,13 +108,14 @@ impl Serving {
         // is asked: each notes whether its request is sent.
         let wanted: Vec<_> = replies.iter().map(Reply::wanted).collect();
         let wanted: Wanted =
-            Arc::new(move |is_sent| wanted.iter().filter(|wanted| wanted(is_sent)).count() > 0);
+            Arc::new(move |moment| wanted.iter().filter(|wanted| wanted(moment)).count() > 0);
         let permit = match request.is_read() {
             true => Permit::default(),
             false => Permit::default().and(standstill::none_since(queued)),
         };
         let permit = Permit { peers, ..permit.and(wanted) };
-        let answered = self.link.exchange(unit_id, &request, timeout, true, &permit).await;
+        let answered =
+            self.link.exchange(unit_id, &request, timeout, DuringPause::Connect, &permit).await;
         drop(turn);
         if let Err(error) = &answered
             && matches!(**error, ClientError::Expired | ClientError::Elsewhere)

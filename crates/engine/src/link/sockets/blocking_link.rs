@@ -15,7 +15,7 @@ use crate::client::{
     BlockingClient, ClientError, Conditions, Endpoint, Lost, Place, StrayCounters,
 };
 use crate::link::fault::Exchanged;
-use crate::link::limits::connect_pause::ConnectPause;
+use crate::link::limits::connect_pause::{ConnectPause, DuringPause};
 use crate::link::limits::flood::Flood;
 use crate::link::limits::lease_fence::Pass;
 use crate::link::limits::permit::Permit;
@@ -39,7 +39,7 @@ struct Call {
     unit_id: u8,
     request: Box<EncodedRequest>,
     timeout: Duration,
-    eager: bool,
+    during_pause: DuringPause,
     permit: Permit,
     /// The result, and when an endpoint that could not be opened is tried again.
     answer: oneshot::Sender<(Exchanged, Option<Instant>)>,
@@ -94,14 +94,14 @@ impl BlockingLink {
         unit_id: u8,
         request: &EncodedRequest,
         timeout: Duration,
-        eager: bool,
+        during_pause: DuringPause,
         permit: &Permit,
     ) -> Exchanged {
         let ended = || Arc::new(ClientError::Lost(Lost::Closed(Closed::BySelf)));
         let (answer, answered) = oneshot::channel();
         let request = Box::new(request.clone());
         let permit = permit.clone();
-        let call = Call { unit_id, request, timeout, eager, permit, answer };
+        let call = Call { unit_id, request, timeout, during_pause, permit, answer };
         self.jobs.send(Job::Call(call)).map_err(|_| ended())?;
         let (answer, retry_at) = answered.await.unwrap_or_else(|_| (Err(ended()), None));
         self.retry_at.set(retry_at);
@@ -124,13 +124,13 @@ impl BlockingLink {
 }
 
 fn carried_out(client: &BlockingClient, call: &Call, pause: &ConnectPause) -> Exchanged {
-    if !call.eager {
+    if call.during_pause == DuringPause::Fail {
         pause.check()?;
     }
     let Call { unit_id, ref request, timeout, ref permit, .. } = *call;
     let allows = permit.fence.as_ref().map(|fence| || fence.allows());
     let conditions = Conditions {
-        may_send: &|is_sent| permit.check(is_sent),
+        may_send: &|moment| permit.check(moment),
         may_continue: allows.as_ref().map(|allows| allows as &dyn Fn() -> bool),
         peers: permit.peers.clone(),
     };

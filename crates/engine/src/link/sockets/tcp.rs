@@ -22,9 +22,9 @@ use tokio::sync::{Mutex, oneshot};
 use tokio::task::AbortHandle;
 use tokio::time::{Instant, sleep, sleep_until, timeout_at};
 
-use crate::client::{ClientError, StrayCounters, connection};
+use crate::client::{ClientError, SendMoment, StrayCounters, connection};
 use crate::link::fault::Exchanged;
-use crate::link::limits::connect_pause::ConnectPause;
+use crate::link::limits::connect_pause::{ConnectPause, DuringPause};
 use crate::link::limits::flood::Flood;
 use crate::link::limits::lease_fence::Pass;
 use crate::link::limits::permit::Permit;
@@ -42,9 +42,12 @@ const LOST: Failure = Failure::Closed(Closed::ByPeer);
 /// Bytes that a socket may leave unsent before its connection is given up.
 const MAX_UNSENT_BYTES: usize = 16 * 1024;
 
+/// Bytes per read of a socket.
+const CHUNK_BYTES: usize = 16 * 1024;
+
 thread_local! {
     /// What is read from a socket at once. All connections of a thread share it: most are idle.
-    static CHUNK: RefCell<Box<[u8]>> = RefCell::new(vec![0; 16 * 1024].into_boxed_slice());
+    static CHUNK: RefCell<Box<[u8]>> = RefCell::new(vec![0; CHUNK_BYTES].into_boxed_slice());
 }
 
 pub(in crate::link) struct TcpLink {
@@ -128,7 +131,7 @@ impl TcpLink {
         unit_id: u8,
         request: &EncodedRequest,
         timeout: Duration,
-        eager: bool,
+        during_pause: DuringPause,
         permit: &Permit,
     ) -> Exchanged {
         let mut deadline = Instant::now() + timeout;
@@ -136,7 +139,7 @@ impl TcpLink {
         let mut attempt = Attempt::default();
         loop {
             if self.open.borrow().is_none() {
-                self.connect(deadline, timeout, eager, permit).await?;
+                self.connect(deadline, timeout, during_pause, permit).await?;
             }
             if let Some(open) = self.open.borrow_mut().as_mut() {
                 if !permit.peers.hold(open.peer) {
@@ -146,7 +149,7 @@ impl TcpLink {
                     open.pass.get_or_insert_with(|| fence.pass());
                 }
             }
-            permit.check(true)?;
+            permit.check(SendMoment::Sending)?;
             let began = pace.began();
             let outcome = self.carry_out(unit_id, request, deadline, attempt, permit).await;
             let Some((answer, again)) = outcome.unwrap_or_else(|lost| Some((Err(lost), None)))
@@ -193,7 +196,7 @@ impl TcpLink {
         &self,
         deadline: Instant,
         timeout: Duration,
-        eager: bool,
+        during_pause: DuringPause,
         permit: &Permit,
     ) -> Result<(), Arc<ClientError>> {
         let too_late = || ClientError::ConnectTimeout { to: self.url.clone(), after: timeout };
@@ -205,13 +208,13 @@ impl TcpLink {
         if let Some(until) = self.flood.until(Instant::now()) {
             self.pause.flooded(until);
         }
-        if !eager {
+        if during_pause == DuringPause::Fail {
             self.pause.check()?;
         }
         if let Some(ended) = self.ended.get() {
             sleep_until((ended + self.tolerance.reconnect).min(deadline)).await;
         }
-        permit.check(false)?;
+        permit.check(SendMoment::Waiting)?;
         let found =
             match timeout_at(deadline, name_lookup::addresses_of(&self.host, self.port)).await {
                 Ok(Ok(all)) if !permit.peers.hold_all(&all) => {
@@ -401,7 +404,7 @@ impl Open {
             held.clear();
         }
         held.retain(|(ticket, permit)| {
-            if permit.is_expected(false) {
+            if permit.is_expected(SendMoment::Waiting) {
                 return true;
             }
             connection.cancel(*ticket, epoch.elapsed());
@@ -557,7 +560,7 @@ mod tests {
             let request = Request::WriteSingleRegister { address: 0, value: 1 };
             let write = EncodedRequest::new(&request);
             let (pace, permit) = (Pace::new(InFlight::Fixed(1)), Permit::default());
-            link.exchange(&pace, 1, &write, TIMEOUT, true, &permit).await.unwrap();
+            link.exchange(&pace, 1, &write, TIMEOUT, DuringPause::Connect, &permit).await.unwrap();
             let open = link.open.borrow();
             let socket = SockRef::from(open.as_ref().unwrap().writer.as_ref());
             let limit = socket.tcp_user_timeout().unwrap();

@@ -421,7 +421,7 @@ fn what_memory_has_refused_is_known_after_a_reload() {
         ];
         for (settings, health) in expected {
             let mut successor = made(settings, &state, &results);
-            successor.follow(device);
+            successor.take_over(device);
             // What the device before it has read last.
             journal.refuse();
             device = successor;
@@ -484,7 +484,7 @@ fn a_device_that_panics_writes_nothing_and_is_in_error_until_it_is_replaced() {
         assert_eq!(turn.amend(0, (AREA, 10, 1), &mut [0; 2]), 0, "no poll needs the write");
 
         state.set_broken(false);
-        inbox.succeed(successor);
+        inbox.replace_with(successor);
         until(|| state.counters.polls.get() > 2 && status()[..2] == [0, 1]).await;
         assert_eq!(registers(&memory)[..8], [1, 2].repeat(4));
         running.abort();
@@ -649,7 +649,7 @@ fn a_poll_that_was_wanted_soon_is_so_for_each_later_successor() {
             if at_once {
                 successor.want_soon();
             }
-            inbox.succeed(successor);
+            inbox.replace_with(successor);
         }
         let Message::Successor(successor) = inbox.next().await else { panic!("a successor") };
         assert!(successor.schedule.is_wanted_soon());

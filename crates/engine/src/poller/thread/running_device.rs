@@ -13,6 +13,7 @@ use tokio::task::{AbortHandle, spawn_local};
 
 use super::links::UsedLink;
 use super::polled_device::Polled;
+use crate::client::SendMoment;
 use crate::link::{Fault, Fence, Link, Permit, Priority, Stage, Wanted, fault, standstill};
 use crate::poller::destination::{ReadSettings, mirrors};
 use crate::poller::device::{Device, DeviceSettings, Inbox, Planned};
@@ -82,7 +83,7 @@ impl RunningDevice {
     }
 
     /// Whether the task of the device has panicked. It does not end otherwise.
-    pub(super) fn has_ended(&self) -> bool {
+    pub(super) fn has_panicked(&self) -> bool {
         self.device.is_finished()
     }
 
@@ -116,7 +117,7 @@ impl RunningDevice {
         if at_once {
             device.want_soon();
         }
-        self.inbox.succeed(device);
+        self.inbox.replace_with(device);
     }
 
     /// Of a write: it is sent only while its device is there.
@@ -139,17 +140,21 @@ impl RunningDevice {
         let inbox = Rc::clone(&self.inbox);
         let RunningDevice { unit_id, timeout, release, .. } = *self;
         let until = until.map(|until| until + timeout);
-        // Set once, by the thread of the link or by the end of the device.
-        let is_sent = Arc::new(OnceLock::new());
+        // Decided once, by the thread of the link or by the end of the device.
+        let fate = Arc::new(OnceLock::new());
         let mut device = self.writes.subscribe();
-        let (sent, receiver) = (Arc::clone(&is_sent), Arc::clone(&to));
+        let (decided, receiver) = (Arc::clone(&fate), Arc::clone(&to));
         let permit = self.permit(until).and(standstill::none_since(queued));
-        let permit = permit.and(Arc::new(move |is_sent| {
-            !receiver.has_withdrawn() && (!is_sent || *sent.get_or_init(|| true))
+        let permit = permit.and(Arc::new(move |moment| {
+            !receiver.has_withdrawn()
+                && match moment {
+                    SendMoment::Waiting => true,
+                    SendMoment::Sending => *decided.get_or_init(|| Fate::Sent) == Fate::Sent,
+                }
         }));
         let withdrawn = async move {
             let _ends = device.changed().await;
-            if *is_sent.get_or_init(|| false) {
+            if *fate.get_or_init(|| Fate::Withdrawn) == Fate::Sent {
                 future::pending::<()>().await;
             }
         };
@@ -159,7 +164,7 @@ impl RunningDevice {
             let taken = taken.ok_or(Fault::Expired)?.ok_or(Fault::Standby)?;
             let answer = link.call(unit_id, &request, timeout, Priority::Urgent, &permit).await;
             drop(taken);
-            if release || has_ended(fence) {
+            if release || stands_by(fence) {
                 link.release();
             }
             if answer.is_ok() {
@@ -194,15 +199,22 @@ impl RunningDevice {
             }
             changes.into_iter().for_each(|change| turn.note(change));
             drop(taken);
-            if release || has_ended(fence) {
+            if release || stands_by(fence) {
                 link.release();
             }
         });
     }
 }
 
+/// What came first: that a write was sent, or that its device was removed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Fate {
+    Sent,
+    Withdrawn,
+}
+
 /// Whether a device stands by, so that a write leaves no connection behind.
-fn has_ended(fence: Option<&Arc<Fence>>) -> bool {
+fn stands_by(fence: Option<&Arc<Fence>>) -> bool {
     fence.is_some_and(|fence| fence.stage() != Stage::Open)
 }
 

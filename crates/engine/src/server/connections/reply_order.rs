@@ -19,7 +19,7 @@ use holdfast_protocol::frame::mbap;
 use holdfast_protocol::pdu::ExceptionCode;
 use tokio::sync::watch;
 
-use crate::link::{Asker, PendingReply, Reply, exception, source};
+use crate::link::{Asker, PendingReply, Reply, exception, new_source};
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::peer::Peer;
 use crate::server::reports::audit::{Forwarded, Permit};
@@ -80,7 +80,7 @@ pub(in crate::server) enum Deferral {
 
 impl Default for Deferred {
     fn default() -> Deferred {
-        Deferred { source: source(), waiting: VecDeque::new(), behind: Vec::new() }
+        Deferred { source: new_source(), waiting: VecDeque::new(), behind: Vec::new() }
     }
 }
 

@@ -17,7 +17,7 @@ use serial2_tokio::SerialPort;
 use tokio::sync::watch;
 use tokio::time::{sleep, sleep_until, timeout};
 
-use crate::link::{Asker, source};
+use crate::link::{Asker, new_source};
 use crate::serial_line::{LineMode, OpenLine, SerialLine};
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
@@ -109,7 +109,7 @@ impl ModbusSerial {
             unit_server,
             rights,
             line,
-            source: source(),
+            source: new_source(),
             delimiter: AtomicU8::new(ASCII_DELIMITER),
             reported: Reported::default(),
         }

@@ -17,7 +17,7 @@ use tokio::net::UdpSocket;
 use tokio::sync::watch;
 use tokio::task::{JoinSet, yield_now};
 
-use crate::link::{Asker, Reply, source};
+use crate::link::{Asker, Reply, new_source};
 use crate::server::connections::given_up::has_given_up;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
@@ -283,7 +283,7 @@ impl PendingReplies {
     }
 
     fn asker(&self, address: IpAddr) -> Asker {
-        let source = self.clients.get(&address).map_or_else(source, |client| client.source);
+        let source = self.clients.get(&address).map_or_else(new_source, |client| client.source);
         Asker { source, peer: Some(address) }
     }
 
