@@ -6,7 +6,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::pin::{Pin, pin};
 use std::sync::Arc;
-use std::task::{Context, Poll};
+use std::task::Poll;
 use std::time::{Duration, Instant};
 
 use bytes::{Bytes, BytesMut};
@@ -17,11 +17,11 @@ use hyper::service::service_fn;
 use hyper::{Request, Response, StatusCode, Version};
 use tokio::net::TcpStream;
 use tokio::sync::watch;
-use tokio::time::{Sleep, sleep_until, timeout_at};
+use tokio::time::{sleep_until, timeout_at};
 
 use super::exchange::{Abandoned, Event, Exchange, Order, RequestHead, ResponseHead};
 use super::front::Front;
-use super::line::{SharedLine, Verdict, Wire};
+use super::line::{ConnectionEnd, NEVER, SharedLine, Wire};
 use super::refusal::{Refusal, RefusalBody};
 use super::request_bytes::MAX_HEADER_BYTES;
 use super::response_body::ResponseBody;
@@ -42,20 +42,6 @@ const SKIPPED_CHUNK_BYTES: usize = 65_536;
 /// The type of a TLS record that begins a handshake (RFC 8446, 5.1).
 const HANDSHAKE: u8 = 22;
 
-/// The longest pause of the alarm for the deadlines.
-const NEVER: Duration = Duration::from_secs(3600);
-
-/// How a connection ends.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum End {
-    /// After a response. What the peer still sends is read for a while, so that it gets the response.
-    Answered,
-    /// Between requests. With TLS, the end is announced.
-    Idle,
-    /// At once: the peer is gone or late, its request is broken, or the handler has abandoned it.
-    Dropped,
-}
-
 /// Serves a connection to its end.
 pub(super) async fn serve(
     front: Arc<Front>,
@@ -72,9 +58,9 @@ pub(super) async fn serve(
     let end = converse(&front, &line, stop.clone()).await;
     let Some(mut line) = line.into_line() else { return };
     match end {
-        End::Dropped => return,
-        End::Idle => return line.announce_end(),
-        End::Answered => {}
+        ConnectionEnd::Dropped => return,
+        ConnectionEnd::Idle => return line.announce_end(),
+        ConnectionEnd::Answered => {}
     }
     if line.has_unread() {
         line.ticket.set_answered();
@@ -141,7 +127,7 @@ pub(super) async fn converse(
     front: &Arc<Front>,
     shared: &SharedLine,
     mut stop: watch::Receiver<bool>,
-) -> End {
+) -> ConnectionEnd {
     let mut stopped = pin!(stop.wait_for(|stop| *stop));
     let mut alarm = pin!(sleep_until((Instant::now() + NEVER).into()));
     let begun = || {
@@ -162,12 +148,12 @@ pub(super) async fn converse(
             is_stopping |= stops_now;
             let Some(connection) = &mut serving else {
                 if is_stopping {
-                    return Poll::Ready(End::Idle);
+                    return Poll::Ready(ConnectionEnd::Idle);
                 }
                 let mut line = shared.lock();
                 match line.poll_fill(context) {
-                    Poll::Ready(Ok(0)) if line.is_used => return Poll::Ready(End::Idle),
-                    Poll::Ready(Ok(0) | Err(_)) => return Poll::Ready(End::Dropped),
+                    Poll::Ready(Ok(0)) if line.is_used => return Poll::Ready(ConnectionEnd::Idle),
+                    Poll::Ready(Ok(0) | Err(_)) => return Poll::Ready(ConnectionEnd::Dropped),
                     Poll::Ready(Ok(_)) => serving = Some(Box::pin(begun())),
                     Poll::Pending => return line.poll_deadlines(context, alarm.as_mut()),
                 }
@@ -177,18 +163,22 @@ pub(super) async fn converse(
                 let line = shared.lock();
                 // The peer may never send the rest.
                 if !line.is_busy() || line.lacks_rest() {
-                    return Poll::Ready(End::Idle);
+                    return Poll::Ready(ConnectionEnd::Idle);
                 }
                 drop(line);
                 connection.as_mut().graceful_shutdown();
             }
             if let Poll::Ready(ended) = connection.as_mut().poll(context) {
                 let has_response = ended.is_ok() || shared.lock().refused.is_some();
-                return Poll::Ready(if has_response { End::Answered } else { End::Dropped });
+                return Poll::Ready(if has_response {
+                    ConnectionEnd::Answered
+                } else {
+                    ConnectionEnd::Dropped
+                });
             }
             let mut line = shared.lock();
             if line.poll_ahead(context) || line.is_left() {
-                return Poll::Ready(End::Dropped);
+                return Poll::Ready(ConnectionEnd::Dropped);
             }
             if !line.is_idle() {
                 return line.poll_deadlines(context, alarm.as_mut());
@@ -198,43 +188,6 @@ pub(super) async fn converse(
         }
     })
     .await
-}
-
-impl super::line::Line {
-    /// Whether the client is gone, although its connection is only half closed.
-    fn is_left(&self) -> bool {
-        let leaves = |exchange: &Arc<Exchange>| self.front.settings.leaving || exchange.leaves();
-        self.is_ended && self.is_busy() && self.exchange.as_ref().is_some_and(leaves)
-    }
-
-    /// Ready when a deadline has passed: the connection ends.
-    fn poll_deadlines(
-        &mut self,
-        context: &mut Context<'_>,
-        mut alarm: Pin<&mut Sleep>,
-    ) -> Poll<End> {
-        loop {
-            let due = self.due().unwrap_or_else(|| Instant::now() + NEVER);
-            if alarm.deadline().into_std() > due {
-                alarm.as_mut().reset(due.into());
-            }
-            if alarm.as_mut().poll(context).is_pending() {
-                return Poll::Pending;
-            }
-            match self.look(Instant::now()) {
-                Verdict::Stay => {
-                    let next = self.due().unwrap_or_else(|| Instant::now() + NEVER);
-                    alarm.as_mut().reset(next.into());
-                }
-                Verdict::Drop(kind) => {
-                    self.front.ended(kind, self.peer.clone());
-                    let is_idle = kind == Kind::Idle;
-                    return Poll::Ready(if is_idle { End::Idle } else { End::Dropped });
-                }
-                Verdict::DropAgain => return Poll::Ready(End::Dropped),
-            }
-        }
-    }
 }
 
 /// Hands a request to its handler, and returns the response. hyper reads the body once this returns the

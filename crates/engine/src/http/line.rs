@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use holdfast_runtime::lock;
 use hyper::rt::{Read, ReadBufCursor, Write};
 use socket2::SockRef;
+use tokio::time::Sleep;
 
 use super::exchange::{Exchange, Order};
 use super::front::Front;
@@ -20,14 +21,17 @@ use crate::server::reports::event::Kind;
 use crate::server::transports::stream::{self, End, Stream};
 
 /// Bytes per read of the socket, and the most that a connection holds of requests that were sent ahead.
-const CHUNK: usize = 16 * 1024;
+const CHUNK_BYTES: usize = 16 * 1024;
 
 /// The time that a handler has to answer a request that did not arrive in time.
 const LATE_ANSWER: Duration = Duration::from_secs(1);
 
+/// The longest pause of the alarm for the deadlines.
+pub(super) const NEVER: Duration = Duration::from_secs(3600);
+
 thread_local! {
     static INPUT: std::cell::RefCell<Box<[u8]>> =
-        std::cell::RefCell::new(vec![0; CHUNK].into_boxed_slice());
+        std::cell::RefCell::new(vec![0; CHUNK_BYTES].into_boxed_slice());
 }
 
 /// How far the current request has been answered.
@@ -79,9 +83,20 @@ pub(super) struct Line {
 #[derive(Clone)]
 pub(super) struct SharedLine(Arc<Mutex<Line>>);
 
+/// How a connection ends.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum ConnectionEnd {
+    /// After a response. What the peer still sends is read for a while, so that it gets the response.
+    Answered,
+    /// Between requests. With TLS, the end is announced.
+    Idle,
+    /// At once: the peer is gone or late, its request is broken, or the handler has abandoned it.
+    Dropped,
+}
+
 /// What a deadline that has passed asks for.
 #[derive(Debug, PartialEq, Eq)]
-pub(super) enum Verdict {
+enum Verdict {
     Stay,
     Drop(Kind),
     /// As `Drop`, after it was reported already.
@@ -176,6 +191,12 @@ impl Line {
     /// Whether a request waits for its response.
     pub(super) fn is_busy(&self) -> bool {
         matches!(self.answer, Answer::Awaited | Answer::Begun)
+    }
+
+    /// Whether the client is gone, although its connection is only half closed.
+    pub(super) fn is_left(&self) -> bool {
+        let leaves = |exchange: &Arc<Exchange>| self.front.settings.leaving || exchange.leaves();
+        self.is_ended && self.is_busy() && self.exchange.as_ref().is_some_and(leaves)
     }
 
     /// Whether the handler waits for the rest of the request.
@@ -318,7 +339,7 @@ impl Line {
         while self.is_busy()
             && self.portion.is_over()
             && !self.is_ended
-            && self.held.len() - self.taken < CHUNK
+            && self.held.len() - self.taken < CHUNK_BYTES
         {
             match self.poll_fill(context) {
                 Poll::Ready(Ok(_)) => {}
@@ -329,19 +350,52 @@ impl Line {
         false
     }
 
+    /// Ready when a deadline has passed: the connection ends.
+    pub(super) fn poll_deadlines(
+        &mut self,
+        context: &mut Context<'_>,
+        mut alarm: Pin<&mut Sleep>,
+    ) -> Poll<ConnectionEnd> {
+        loop {
+            let due = self.due().unwrap_or_else(|| Instant::now() + NEVER);
+            if alarm.deadline().into_std() > due {
+                alarm.as_mut().reset(due.into());
+            }
+            if alarm.as_mut().poll(context).is_pending() {
+                return Poll::Pending;
+            }
+            match self.check_deadlines(Instant::now()) {
+                Verdict::Stay => {
+                    let next = self.due().unwrap_or_else(|| Instant::now() + NEVER);
+                    alarm.as_mut().reset(next.into());
+                }
+                Verdict::Drop(kind) => {
+                    self.front.ended(kind, self.peer.clone());
+                    let is_idle = kind == Kind::Idle;
+                    return Poll::Ready(if is_idle {
+                        ConnectionEnd::Idle
+                    } else {
+                        ConnectionEnd::Dropped
+                    });
+                }
+                Verdict::DropAgain => return Poll::Ready(ConnectionEnd::Dropped),
+            }
+        }
+    }
+
     /// The next time at which a deadline may have passed.
-    pub(super) fn due(&self) -> Option<Instant> {
+    fn due(&self) -> Option<Instant> {
         [self.request_due, self.reply_due, self.idle_due].into_iter().flatten().min()
     }
 
     /// Judges the deadlines.
-    pub(super) fn look(&mut self, now: Instant) -> Verdict {
+    fn check_deadlines(&mut self, now: Instant) -> Verdict {
         let has_passed = |due: Option<Instant>| due.is_some_and(|due| due <= now);
         if has_passed(self.reply_due) {
             return Verdict::Drop(Kind::SlowReader);
         }
         if has_passed(self.request_due) {
-            return self.be_late(now);
+            return self.handle_late_request(now);
         }
         if has_passed(self.idle_due) {
             return Verdict::Drop(Kind::Idle);
@@ -350,7 +404,7 @@ impl Line {
     }
 
     /// A request did not arrive in time. Its handler may answer if it waits for the body.
-    fn be_late(&mut self, now: Instant) -> Verdict {
+    fn handle_late_request(&mut self, now: Instant) -> Verdict {
         match &self.exchange {
             _ if self.is_late => Verdict::DropAgain,
             Some(_) if self.is_busy() && !self.is_asked => {
