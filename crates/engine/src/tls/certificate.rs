@@ -146,8 +146,8 @@ impl Parsed {
         found.ok().flatten().map(|(_, constraints)| constraints)
     }
 
-    /// Whether its issuer is its own subject.
-    pub(super) fn is_self_signed(&self) -> bool {
+    /// Whether its issuer is its own subject. Its signature may be that of another key.
+    pub(super) fn is_self_issued(&self) -> bool {
         self.certificate.tbs_certificate().issuer() == self.certificate.tbs_certificate().subject()
     }
 
@@ -161,7 +161,7 @@ impl Parsed {
 
     /// # Errors
     /// `now` is outside its dates.
-    pub(super) fn is_valid_at(&self, now: UnixTime) -> Result<(), CertificateError> {
+    pub(super) fn check_dates(&self, now: UnixTime) -> Result<(), CertificateError> {
         let (not_before, not_after) = self.validity();
         if now < not_before {
             return Err(CertificateError::NotValidYetContext { time: now, not_before });
@@ -174,7 +174,7 @@ impl Parsed {
 
     /// # Errors
     /// Its `extendedKeyUsage` lacks the purpose.
-    pub(super) fn is_for(&self, purpose: Purpose) -> Result<(), CertificateError> {
+    pub(super) fn check_purpose(&self, purpose: Purpose) -> Result<(), CertificateError> {
         let named = self.certificate.tbs_certificate().get_extension::<ExtendedKeyUsage>();
         match named.map_err(|_| CertificateError::BadEncoding)? {
             Some((_, ExtendedKeyUsage(named))) => {
@@ -228,7 +228,7 @@ impl Parsed {
         self.is_issued_by(authority)
             && self.has_signature_of(authority).unwrap_or_else(|| {
                 let named = self.authority_key();
-                if self.is_self_signed() && (named.is_none() || named == self.own_key()) {
+                if self.is_self_issued() && (named.is_none() || named == self.own_key()) {
                     return self.key() == authority.key();
                 }
                 let keys = named.zip(authority.own_key());
@@ -414,10 +414,10 @@ mod tests {
         let early =
             CertificateError::NotValidYetContext { time: at(first - 1), not_before: at(first) };
         let late = CertificateError::ExpiredContext { time: at(last + 1), not_after: at(last) };
-        assert_eq!(certificate.is_valid_at(at(first - 1)), Err(early));
-        assert_eq!(certificate.is_valid_at(at(first)), Ok(()));
-        assert_eq!(certificate.is_valid_at(at(last)), Ok(()));
-        assert_eq!(certificate.is_valid_at(at(last + 1)), Err(late));
+        assert_eq!(certificate.check_dates(at(first - 1)), Err(early));
+        assert_eq!(certificate.check_dates(at(first)), Ok(()));
+        assert_eq!(certificate.check_dates(at(last)), Ok(()));
+        assert_eq!(certificate.check_dates(at(last + 1)), Err(late));
     }
 
     #[test]

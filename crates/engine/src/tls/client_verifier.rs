@@ -10,7 +10,7 @@ use rustls::{CertificateError, DistinguishedName, Error, OtherError};
 
 use super::TlsFailure;
 use super::certificate::{Parsed, Purpose};
-use super::file_warnings::Doubts;
+use super::file_warnings::FileWarnings;
 use super::files::FileError;
 use super::handshake_notes::{Chain, noted};
 use super::provider::handshake_signatures;
@@ -31,7 +31,7 @@ impl Clients {
     /// `None`: clients need no certificate.
     pub(super) fn load(
         files: &ServerFiles,
-        doubts: &mut Doubts<'_>,
+        warnings: &mut FileWarnings<'_>,
     ) -> Result<Option<Clients>, FileError> {
         let ca_key = files.protocol.ca_key();
         let Some(ca_file) = &files.ca_file else {
@@ -41,8 +41,8 @@ impl Clients {
         let names: BTreeSet<_> =
             listed.iter().filter_map(|each| each.parsed.accepted_issuer()).collect();
         let accepted_issuers = names.into_iter().map(DistinguishedName::from).collect();
-        doubts.of_listed(ca_file, &listed);
-        let may_have_list = |each: &Listed| each.is_authority() || !each.parsed.is_self_signed();
+        warnings.of_listed(ca_file, &listed);
+        let may_have_list = |each: &Listed| each.is_authority() || !each.parsed.is_self_issued();
         let lists = match &files.crl_file {
             Some(file) if !listed.iter().any(may_have_list) => {
                 let flaw = format!(
@@ -56,7 +56,7 @@ impl Clients {
         };
         let trust = Trust::new(listed, Lists { lists });
         if let Some(file) = &files.crl_file {
-            doubts.of_lists(file, &trust);
+            warnings.of_lists(file, &trust);
         }
         Ok(Some(Clients { trust, accepted_issuers, roles: files.roles.clone() }))
     }
@@ -163,7 +163,7 @@ mod tests {
                 ca_file: Some(party.folder.write("listed.pem", &text)),
                 ..party.files()
             };
-            let clients = Clients::load(&files, &mut Doubts::new(&files, UnixTime::now()));
+            let clients = Clients::load(&files, &mut FileWarnings::new(&files, UnixTime::now()));
             let clients = clients.unwrap().unwrap();
             clients.root_hint_subjects().iter().map(|name| name.as_ref().to_vec()).collect()
         };

@@ -12,15 +12,15 @@ use super::server_files::ServerFiles;
 use super::trust::{Listed, Trust};
 
 /// Finds what is doubtful.
-pub(super) struct Doubts<'f> {
+pub(super) struct FileWarnings<'f> {
     files: &'f ServerFiles,
     now: UnixTime,
     found: Vec<String>,
 }
 
-impl<'f> Doubts<'f> {
-    pub(super) fn new(files: &'f ServerFiles, now: UnixTime) -> Doubts<'f> {
-        Doubts { files, now, found: Vec::new() }
+impl<'f> FileWarnings<'f> {
+    pub(super) fn new(files: &'f ServerFiles, now: UnixTime) -> FileWarnings<'f> {
+        FileWarnings { files, now, found: Vec::new() }
     }
 
     pub(super) fn found(self) -> Vec<String> {

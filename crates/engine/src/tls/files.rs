@@ -10,7 +10,7 @@ use rustls::server::ParsedCertificate;
 use thiserror::Error;
 
 /// The size limit of a file, in bytes.
-const MAX_FILE_LEN: u64 = 4 << 20;
+const MAX_FILE_BYTES: u64 = 4 << 20;
 
 /// The first byte of a certificate or key in DER.
 const SEQUENCE: u8 = 0x30;
@@ -97,10 +97,11 @@ fn read(file: &Path) -> Result<Vec<u8>, FileError> {
     let unreadable = |error| FileError::Unreadable { file: file.display().to_string(), error };
     let mut text = Vec::new();
     File::open(file)
-        .and_then(|opened| opened.take(MAX_FILE_LEN + 1).read_to_end(&mut text))
+        .and_then(|opened| opened.take(MAX_FILE_BYTES + 1).read_to_end(&mut text))
         .map_err(unreadable)?;
-    if text.len() as u64 > MAX_FILE_LEN {
-        let flaw = format!("more than {MAX_FILE_LEN} bytes, allowed: certificates or a key in PEM");
+    if text.len() as u64 > MAX_FILE_BYTES {
+        let flaw =
+            format!("more than {MAX_FILE_BYTES} bytes, allowed: certificates or a key in PEM");
         return Err(FileError::content(file, flaw));
     }
     Ok(text)

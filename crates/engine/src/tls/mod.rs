@@ -32,7 +32,7 @@ pub use failure::TlsFailure;
 pub use files::FileError;
 
 /// Bytes of plain text per read.
-const CHUNK: usize = 4096;
+const CHUNK_BYTES: usize = 4096;
 
 /// The TLS state of one connection.
 pub struct Channel(Connection);
@@ -91,7 +91,7 @@ impl Channel {
     }
 
     fn take(&mut self, plain: &mut Vec<u8>) {
-        let mut chunk = [0; CHUNK];
+        let mut chunk = [0; CHUNK_BYTES];
         while let Ok(len @ 1..) = self.0.reader().read(&mut chunk) {
             plain.extend_from_slice(&chunk[..len]);
         }

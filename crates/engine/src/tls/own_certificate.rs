@@ -32,7 +32,7 @@ pub(super) fn own(
     let [end_entity, ..] = chain.as_slice() else {
         return Err(FileError::content(cert_file, "found no certificate"));
     };
-    is_in_order(&chain).map_err(|flaw| FileError::content(cert_file, flaw))?;
+    check_order(&chain).map_err(|flaw| FileError::content(cert_file, flaw))?;
     let key = signing_key(key, end_entity)
         .ok_or_else(|| wrong(format!("found a key of another kind, allowed: {KEYS}")))?;
     let own = CertifiedKey::new(chain, key);
@@ -47,7 +47,7 @@ pub(super) fn own(
 
 /// # Errors
 /// A certificate is not the issuer of the one before it.
-fn is_in_order(chain: &[CertificateDer<'_>]) -> Result<(), String> {
+fn check_order(chain: &[CertificateDer<'_>]) -> Result<(), String> {
     for (pair, number) in chain.windows(2).zip(2..) {
         let [below, above] = [&pair[0], &pair[1]].map(|der| Parsed::new(der));
         if let (Ok(below), Ok(above)) = (below, above)

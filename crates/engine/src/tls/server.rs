@@ -14,7 +14,7 @@ use rustls::{AlertDescription, Error, ProtocolVersion, ServerConfig, ServerConne
 
 use super::certificate::Parsed;
 use super::client_verifier::Clients;
-use super::file_warnings::Doubts;
+use super::file_warnings::FileWarnings;
 use super::files::FileError;
 use super::handshake_notes::Notes;
 use super::hello::{Hello, LENGTHS, RECORD_HEADER_LEN};
@@ -89,9 +89,10 @@ impl ServerTls {
         clock: Arc<dyn TimeProvider>,
     ) -> Result<ServerTls, FileError> {
         let own = own(&files.cert_file, &files.key_file, key)?;
-        let mut doubts = Doubts::new(files, clock.current_time().unwrap_or(UnixTime::now()));
-        doubts.of_own(&own.cert);
-        let clients = Clients::load(files, &mut doubts)?.map(Arc::new);
+        let mut warnings =
+            FileWarnings::new(files, clock.current_time().unwrap_or(UnixTime::now()));
+        warnings.of_own(&own.cert);
+        let clients = Clients::load(files, &mut warnings)?.map(Arc::new);
         let sessions = Arc::new(Sessions::new(clients.clone(), Arc::clone(&clock)));
         let config = ServerConfig::builder_with_details(provider(), clock)
             .with_safe_default_protocol_versions()
@@ -108,7 +109,7 @@ impl ServerTls {
             configs: Arc::new(Configs::new(files.protocol, config)),
             clients,
             sessions,
-            warnings: doubts.found(),
+            warnings: warnings.found(),
         })
     }
 

@@ -155,8 +155,8 @@ impl Trust {
         let parsed = Parsed::new(presented)?;
         let end_entity = EndEntityCert::try_from(presented).map_err(refused)?;
         check_key(parsed.key()).map_err(wrapped)?;
-        parsed.is_valid_at(now)?;
-        parsed.is_for(purpose)?;
+        parsed.check_dates(now)?;
+        parsed.check_purpose(purpose)?;
         if let Some(listed) = self.listed.iter().find(|listed| listed.certificate == *presented) {
             return match self.is_revoked(listed) {
                 true => Err(CertificateError::Revoked.into()),
@@ -178,12 +178,12 @@ impl Trust {
     fn find_issuer(&self, path: &Path<'_>) -> Result<(), Error> {
         let authorities = self.listed.iter().filter(|listed| listed.is_authority());
         let (valid, outdated): (Vec<_>, Vec<_>) =
-            authorities.partition(|listed| listed.parsed.is_valid_at(path.now).is_ok());
+            authorities.partition(|listed| listed.parsed.check_dates(path.now).is_ok());
         match self.find_path(path, &valid) {
             // Look for a path to an expired authority, only to report that as the cause.
             Err(webpki::Error::UnknownIssuer) => {
                 let due = outdated.iter().find(|each| self.find_path(path, &[**each]).is_ok());
-                let due = due.map_or(Ok(()), |due| due.parsed.is_valid_at(path.now));
+                let due = due.map_or(Ok(()), |due| due.parsed.check_dates(path.now));
                 due.map_err(|flaw| wrapped(issuer_failure(flaw)))?;
                 Err(CertificateError::UnknownIssuer.into())
             }
@@ -255,7 +255,7 @@ fn allowed<'l>(
             return Err(webpki::Error::EndEntityUsedAsCa);
         }
         // Self-issued certificates do not count (RFC 5280, 4.2.1.9).
-        len += usize::from(!parsed.is_self_signed());
+        len += usize::from(!parsed.is_self_issued());
     }
     let (name, key) = (&path.anchor().subject, &path.anchor().subject_public_key_info);
     let is_anchor = |listed: &&&Listed| {

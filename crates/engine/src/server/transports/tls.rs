@@ -23,7 +23,7 @@ use crate::tls::TlsFailure;
 use crate::tls::server::{PeerCertificate, ServerChannel, ServerTls};
 
 /// Bytes per read of a socket.
-const INPUT: usize = 4096;
+const INPUT_BYTES: usize = 4096;
 
 /// The header of a record, in bytes.
 const HEADER_LEN: usize = 5;
@@ -37,7 +37,7 @@ struct Scratch {
 
 thread_local! {
     static SCRATCH: RefCell<Scratch> = RefCell::new(Scratch {
-        input: vec![0; INPUT].into_boxed_slice(),
+        input: vec![0; INPUT_BYTES].into_boxed_slice(),
         plain: Vec::new(),
         output: Vec::new(),
     });
