@@ -68,7 +68,7 @@ impl Engine {
     }
 
     fn sessions<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyDict>>> {
-        let listeners = self.core.sessions();
+        let listeners = self.core.open_connections();
         let all = listeners.iter().flat_map(|(listener, sessions)| {
             sessions.iter().map(move |session| (listener, session))
         });
@@ -76,7 +76,7 @@ impl Engine {
     }
 
     fn end_session(&self, py: Python<'_>, listener: &str, id: u64) -> bool {
-        py.detach(|| self.core.end_session(listener, id))
+        py.detach(|| self.core.end_connection(listener, id))
     }
 
     fn heartbeats(&self) -> Vec<(String, f64, Option<u32>)> {

@@ -293,7 +293,9 @@ impl Listener {
             idle_timeout: (!idle_timeout.is_zero()).then_some(idle_timeout),
             request_timeout: time_to_wait("request_timeout", options.request_timeout)?,
             frame_timeout: (framing == StreamFraming::Rtu).then_some(frame_timeout),
-            keepalive: within("keepalive", options.keepalive, 1..=32_767)? as u16,
+            keepalive: Duration::from_secs(
+                within("keepalive", options.keepalive, 1..=32_767)? as u64
+            ),
             units: UnitSettings { listen_only: options.listen_only, event_log: options.event_log },
             tls: options.tls.map(|tls| tls.of(Protocol::Modbus)).transpose()?,
             raw_ingest,

@@ -176,7 +176,7 @@ impl Setup {
             request_timeout: TIMEOUT,
             frame_timeout: None,
             units: UnitSettings::default(),
-            keepalive: 60,
+            keepalive: Duration::from_secs(60),
             tls: None,
             raw_ingest: None,
         };

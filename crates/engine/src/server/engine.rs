@@ -335,16 +335,16 @@ impl Engine {
     }
 
     /// The open connections of each listener, by its name.
-    pub fn sessions(&self) -> Vec<(Arc<str>, Vec<OpenConnection>)> {
+    pub fn open_connections(&self) -> Vec<(Arc<str>, Vec<OpenConnection>)> {
         let listeners = lock(&self.listeners);
-        let sessions = |listener: &Arc<Listener>| {
-            (Arc::clone(&listener.context.name), listener.context.admission.sessions())
+        let of = |listener: &Arc<Listener>| {
+            (Arc::clone(&listener.context.name), listener.context.admission.open_connections())
         };
-        listeners.iter().map(sessions).collect()
+        listeners.iter().map(of).collect()
     }
 
     /// Ends a connection. Returns whether there was one.
-    pub fn end_session(&self, listener: &str, id: u64) -> bool {
+    pub fn end_connection(&self, listener: &str, id: u64) -> bool {
         let listeners = lock(&self.listeners);
         let found = listeners.iter().find(|running| *running.context.name == *listener);
         let ended = found.and_then(|running| {

@@ -1,5 +1,5 @@
 //! The open connections of a listener or an HTTP host, and their limits. Which one is closed for a new one:
-//! [`Crowd`].
+//! [`EvictionScope`].
 //!
 //! With TLS, a connection takes a place among the sessions only once its handshake has authenticated
 //! the peer. Until then it has a place among the handshakes, and only handshakes give way to it.
@@ -13,7 +13,7 @@ use std::time::{Duration, Instant, SystemTime};
 use holdfast_runtime::lock;
 use tokio::task::AbortHandle;
 
-use crate::server::connections::eviction::{Activity, Crowd, Held};
+use crate::server::connections::eviction::{Activity, EvictionScope, Held};
 use crate::server::connections::peer::Peer;
 use crate::tls::server::PeerCertificate;
 
@@ -74,6 +74,8 @@ pub(crate) struct Admission {
 #[derive(Debug)]
 struct Table {
     limits: ConnectionLimits,
+    /// Whether the listener has ended, and admits none.
+    is_closed: bool,
     next_id: u64,
     sessions: HashMap<u64, Held>,
     /// In order of age.
@@ -126,6 +128,7 @@ impl Admission {
     pub(crate) fn new(limits: ConnectionLimits) -> Admission {
         let table = Table {
             limits,
+            is_closed: false,
             next_id: 0,
             sessions: HashMap::new(),
             handshakes: BTreeMap::new(),
@@ -199,13 +202,13 @@ impl Admission {
     /// Ends all connections. From now on, none is admitted. Returns their peers.
     pub(crate) fn close(&self) -> Vec<Peer> {
         let mut table = lock(&self.table);
-        table.limits = ConnectionLimits::NONE;
+        (table.limits, table.is_closed) = (ConnectionLimits::NONE, true);
         let ids: Vec<u64> = table.held().map(|(id, _)| *id).collect();
         ids.into_iter().filter_map(|id| table.end(id)).map(|held| held.peer).collect()
     }
 
     pub(crate) fn is_closed(&self) -> bool {
-        lock(&self.table).limits == ConnectionLimits::NONE
+        lock(&self.table).is_closed
     }
 
     /// Ends one connection. Returns its peer, `None` if there is no such connection.
@@ -214,9 +217,9 @@ impl Admission {
     }
 
     /// The open connections, in the order in which they were opened.
-    pub(crate) fn sessions(&self) -> Vec<OpenConnection> {
+    pub(crate) fn open_connections(&self) -> Vec<OpenConnection> {
         let now = self.since(Instant::now());
-        let session = |(id, held): (&u64, &Held)| OpenConnection {
+        let connection = |(id, held): (&u64, &Held)| OpenConnection {
             id: *id,
             peer: held.peer.clone(),
             opened: held.opened,
@@ -224,9 +227,9 @@ impl Admission {
                 now.saturating_sub(held.activity.last_request.load(Ordering::Relaxed)),
             ),
         };
-        let mut sessions: Vec<OpenConnection> = lock(&self.table).held().map(session).collect();
-        sessions.sort_unstable_by_key(|session| session.id);
-        sessions
+        let mut open: Vec<OpenConnection> = lock(&self.table).held().map(connection).collect();
+        open.sort_unstable_by_key(|connection| connection.id);
+        open
     }
 
     pub(crate) fn open(&self) -> usize {
@@ -242,51 +245,51 @@ impl Admission {
 impl Table {
     /// Makes sure that there is a place for a session.
     fn clear_session(&mut self, source: IpAddr, now: u64) -> Result<Option<Evicted>, Full> {
-        let Some(crowd) = self.crowd(source) else {
+        let Some(scope) = self.full_scope(source) else {
             return Ok(None);
         };
-        if let Some(id) = crowd.answered(&self.sessions) {
+        if let Some(id) = scope.answered(&self.sessions) {
             return Ok(self.end(id).map(|held| Evicted::Answered(held.peer)));
         }
-        self.evict(crowd, now).map(Some)
+        self.evict(scope, now).map(Some)
     }
 
     /// The sessions that leave no place for one of `source`. `None`: there is a place.
-    fn crowd(&self, source: IpAddr) -> Option<Crowd> {
-        if self.is_most(self.places(source).sessions) {
-            Some(Crowd::OfSource(source))
+    fn full_scope(&self, source: IpAddr) -> Option<EvictionScope> {
+        if self.source_is_full(self.places(source).sessions) {
+            Some(EvictionScope::Source(source))
         } else {
-            (self.sessions.len() >= self.limits.max_connections).then_some(Crowd::All)
+            (self.sessions.len() >= self.limits.max_connections).then_some(EvictionScope::All)
         }
     }
 
     /// Makes sure that there is a place for a handshake.
     fn clear_handshake(&mut self, source: IpAddr, most: usize) -> Result<Option<Evicted>, Full> {
         let places = self.places(source);
-        if let Some(crowd) = self.crowd(source)
+        if let Some(scope) = self.full_scope(source)
             && self.limits.when_full == WhenFull::Refuse
-            && crowd.answered(&self.sessions).is_none()
+            && scope.answered(&self.sessions).is_none()
         {
             return Err(Full);
         }
-        let crowd = if self.is_most(places.handshakes) {
-            Crowd::OfSource(source)
+        let scope = if self.source_is_full(places.handshakes) {
+            EvictionScope::Source(source)
         } else if self.handshakes.len() < most {
             return Ok(None);
         } else {
-            Crowd::All
+            EvictionScope::All
         };
-        let id = crowd.first_handshake_to_go(&self.handshakes).ok_or(Full)?;
+        let id = scope.first_handshake_to_go(&self.handshakes).ok_or(Full)?;
         Ok(self.end(id).map(|held| Evicted::Handshake(held.peer)))
     }
 
-    /// Closes the session of a crowd that gives way first.
-    fn evict(&mut self, crowd: Crowd, now: u64) -> Result<Evicted, Full> {
+    /// Closes the session that gives way first.
+    fn evict(&mut self, scope: EvictionScope, now: u64) -> Result<Evicted, Full> {
         if self.limits.when_full == WhenFull::Refuse {
             return Err(Full);
         }
         let grace = self.limits.grace.as_micros() as u64;
-        let id = crowd.first_to_go(&self.sessions, now, grace, self.next_unserved);
+        let id = scope.first_to_go(&self.sessions, now, grace, self.next_unserved);
         let held = self.end(id.ok_or(Full)?).ok_or(Full)?;
         if !held.is_served() {
             // Places become free one by one, so that a flood that comes in waves does not get them all.
@@ -295,8 +298,8 @@ impl Table {
         Ok(Evicted::Connection(held.peer))
     }
 
-    /// Whether a source may not have more than this many places of a kind.
-    fn is_most(&self, count: usize) -> bool {
+    /// Whether a source that has so many places of a kind may not have another one.
+    fn source_is_full(&self, count: usize) -> bool {
         self.limits.max_connections_per_source.is_some_and(|most| count >= most)
     }
 
@@ -368,6 +371,7 @@ impl Ticket {
         let evicted = table.clear_session(source, self.admission.since(Instant::now()))?;
         if let Some(held) = table.remove(self.id) {
             let now = self.admission.since(Instant::now());
+            // Never the time of its admission: that stands for a connection which has sent nothing yet.
             self.activity.last_request.store(now.max(held.admitted + 1), Ordering::Relaxed);
             table.insert_session(self.id, held);
         }

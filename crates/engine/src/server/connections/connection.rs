@@ -93,7 +93,7 @@ pub(crate) struct Connection<F: Framing, S> {
     /// Reads since other tasks last ran.
     reads_in_turn: u32,
     /// Whether the runtime may not know that there are bytes to read.
-    is_unaware: bool,
+    readiness_unknown: bool,
     /// Whether the last read took all that had arrived.
     has_read_all: bool,
     share: Share,
@@ -152,7 +152,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             ticket,
             unsent: Vec::new(),
             reads_in_turn: 0,
-            is_unaware: false,
+            readiness_unknown: false,
             has_read_all: false,
             share,
         }
@@ -217,6 +217,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
                         return Poll::Ready(None);
                     }
                     let _ = alarm.as_mut().poll(context);
+                    // Without a budget, both return Pending, and keep no waker: they are polled again.
                     is_armed = coop::has_budget_remaining();
                 }
                 if alarm.is_elapsed() { Poll::Ready(Some(self.on_alarm())) } else { Poll::Pending }
@@ -241,7 +242,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             }
             if self.answering.room() == 0 {
                 self.reads_in_turn = 0;
-                (self.is_unaware, self.has_read_all) = (true, false);
+                (self.readiness_unknown, self.has_read_all) = (true, false);
                 return stream::poll_end(self.stream.socket(), context).map(Err);
             }
         }
@@ -264,8 +265,9 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             let room = self.answering.room();
             let free = &mut input[partial..][..room];
             let unsent = &mut self.unsent;
-            let known = if self.is_unaware { self.stream.read_now(free, unsent) } else { None };
-            self.is_unaware = known.is_some();
+            let known =
+                if self.readiness_unknown { self.stream.read_now(free, unsent) } else { None };
+            self.readiness_unknown = known.is_some();
             let read = match known {
                 Some(len) => Poll::Ready(Ok(len)),
                 None => self.stream.poll_read(context, free, unsent),
@@ -276,12 +278,12 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             };
             self.reads_in_turn += 1;
             let read = read?;
-            self.has_read_all = !self.is_unaware && read < room;
+            self.has_read_all = !self.readiness_unknown && read < room;
             self.renew()?;
             self.answering.gives_up =
                 !F::HAS_IDS && self.answering.is_waiting() && self.deadlines.has_given_up();
             let answered = self.answering.answer(&input[..partial + read], output);
-            self.note_answered(&answered, WORK_OF_READ);
+            self.note_answered(&answered);
             let output = &output[..answered.len];
             if !output.is_empty() {
                 self.stream.send(output, &mut self.unsent)?;
@@ -326,12 +328,12 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
     }
 
     /// Notes the work of the source, and the times that the deadlines depend on.
-    fn note_answered(&mut self, answered: &Answered, work_before: u32) {
+    fn note_answered(&mut self, answered: &Answered) {
         let now = Instant::now();
         if answered.requests > 0 {
             self.note_exchange(now);
         }
-        self.share.charge(work_before + (answered.requests + answered.discarded) as u32);
+        self.share.charge(WORK_OF_READ + (answered.requests + answered.discarded) as u32);
         let is_at_start = F::is_at_start(&self.answering.parser);
         if self.answering.partial.is_empty() && is_at_start && !self.stream.is_amid_record() {
             return self.deadlines.note_complete();
@@ -472,7 +474,7 @@ impl<F: Framing> Answering<F> {
                     rest = &rest[len..];
                     answered.requests += 1;
                     let room = &mut output[answered.len..];
-                    answered.len += self.take((tag, unit_id, pdu), room);
+                    answered.len += self.handle_request((tag, unit_id, pdu), room);
                 }
                 Next::Foreign { len } => {
                     rest = &rest[len..];
@@ -501,7 +503,11 @@ impl<F: Framing> Answering<F> {
     /// Answers a request now, or sends it on its way, or keeps it until others are answered. Returns the length
     /// of the framed reply, 0 when there is none, or none yet.
     #[inline]
-    fn take(&mut self, (tag, unit_id, pdu): (u16, u8, &[u8]), output: &mut [u8]) -> usize {
+    fn handle_request(
+        &mut self,
+        (tag, unit_id, pdu): (u16, u8, &[u8]),
+        output: &mut [u8],
+    ) -> usize {
         let destination = self.unit_server.destination(&self.rights, unit_id, pdu);
         if destination.is_some() || self.deferred.is_some() {
             let deferred = self.deferred.get_or_insert_default();
@@ -524,7 +530,7 @@ impl<F: Framing> Answering<F> {
         let behind = self.deferred.as_mut().map(|deferred| deferred.resume()).unwrap_or_default();
         let (mut rest, mut written, mut taken) = (&behind[..], 0, 0);
         while let mbap::Next::Frame { transaction_id, unit_id, pdu, len } = mbap::next(rest) {
-            written += self.take((transaction_id, unit_id, pdu), &mut output[written..]);
+            written += self.handle_request((transaction_id, unit_id, pdu), &mut output[written..]);
             rest = &rest[len..];
             taken += 1;
         }
@@ -595,7 +601,7 @@ impl<F: Framing> Answering<F> {
         let Some(deferred) = self.deferred.as_mut().filter(|deferred| !deferred.is_empty()) else {
             return;
         };
-        let given_up = deferred.give_up(!F::HAS_IDS);
+        let given_up = deferred.give_up(F::HAS_BROADCASTS);
         let running = self.running.clone();
         let (context, unit_server) = (Arc::clone(&self.context), Arc::clone(&self.unit_server));
         let peer = self.peer.clone();

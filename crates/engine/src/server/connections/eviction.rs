@@ -22,18 +22,18 @@ const LONGER_WITHOUT_REQUEST: Duration = Duration::from_secs(60);
 /// another.
 const FIRST_BYTES_TIME: Duration = Duration::from_millis(100);
 
-/// Connections that leave no place for another one.
+/// Among which connections one gives way, because together they leave no place for another one.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Crowd {
-    OfSource(IpAddr),
+pub(super) enum EvictionScope {
+    Source(IpAddr),
     All,
 }
 
-impl Crowd {
+impl EvictionScope {
     pub(super) fn has(self, held: &Held) -> bool {
         match self {
-            Crowd::OfSource(source) => held.peer.ip() == source,
-            Crowd::All => true,
+            EvictionScope::Source(source) => held.peer.ip() == source,
+            EvictionScope::All => true,
         }
     }
 

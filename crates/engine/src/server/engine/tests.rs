@@ -89,7 +89,7 @@ fn stream(memory: &Arc<Memory>, raw_ingest: Option<RawSettings>) -> StreamSettin
         idle_timeout: None,
         request_timeout: TIMEOUT,
         frame_timeout: None,
-        keepalive: 60,
+        keepalive: Duration::from_secs(60),
         units: UnitSettings::default(),
         tls: None,
         raw_ingest,
@@ -136,7 +136,7 @@ fn connect(address: SocketAddr) -> TcpStream {
 /// Connects to the only listener, and waits until the connection is served.
 fn served(engine: &Engine) -> TcpStream {
     let client = connect(engine.addresses()[0].unwrap());
-    while engine.sessions()[0].1.is_empty() {
+    while engine.open_connections()[0].1.is_empty() {
         thread::yield_now();
     }
     client
@@ -290,7 +290,7 @@ fn a_handshake_that_a_reload_overtakes_is_judged_by_the_new_revocation_list() {
         }
         while matches!(socket.read(&mut [0; 256]), Ok(1..)) {}
         assert_eq!(engine.counters()[0].connections().tls_failed.total(), 1);
-        assert_eq!(engine.sessions()[0].1.len(), 0);
+        assert_eq!(engine.open_connections()[0].1.len(), 0);
     }
 }
 

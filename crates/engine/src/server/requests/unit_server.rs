@@ -2,9 +2,10 @@
 //! (`transports/serial.rs`), units that are not there are silent, and nothing answers a broadcast.
 //!
 //! The checks run in this order: the function is known and allowed (exception 01), the unit is
-//! mapped (0B), form, quantity and value are right (03), a write can be recorded (04), the memory is
-//! not sealed (06), the range is inside its area (02), what it mirrors is not stale (0B). The last three
-//! are checked in `holdfast_memory::Memory`, under its lock. A denied function is refused before the unit
+//! mapped (0B), form, quantity and value are right (03), the ranges of the peer have its addresses (02,
+//! or 06 if the memory is sealed), a write can be recorded (04), the memory is not sealed (06), the range
+//! is inside its area (02), what it mirrors is not stale (0B). The last three are checked in
+//! `holdfast_memory::Memory`, under its lock. A denied function is refused before the unit
 //! is looked up, so that a peer without rights cannot discover units. A unit in listen only mode never
 //! answers. Of the form of a request for a device, only the length is checked (03, [`pdu::may_be_passed_on`]).
 
@@ -194,25 +195,9 @@ impl UnitServer {
         let function_code = request.first().copied().unwrap_or_default();
         self.counters.request(function_code);
         self.comm_events.receive(Received::Request { silent: false });
-        let sent = match destination {
-            _ if !rights.allows(unit_id, function_code) => Err(NOT_ALLOWED),
-            // A gateway may put it on a line, whose devices could read it as several requests: with
-            // functions, and for units, that the peer may not use.
-            RequestDestination::Device(_) if !pdu::may_be_passed_on(request) => {
-                Err(ExceptionCode::IllegalDataValue)
-            }
-            RequestDestination::Device(_) if rights.denies(unit_id, request) => Err(NOT_ALLOWED),
-            RequestDestination::Mirror(passage) if exceeds_ranges(rights, unit_id, request) => {
-                Err(out_of_ranges(&passage.memory))
-            }
-            RequestDestination::Journal(memory) if exceeds_ranges(rights, unit_id, request) => {
-                Err(out_of_ranges(memory))
-            }
-            _ if !can_record() => Err(match destination {
-                RequestDestination::Journal(_) => Request::parse(request).err(),
-                _ => None,
-            }
-            .unwrap_or(ExceptionCode::ServerDeviceFailure)),
+        let checked = check_forwarded(rights, destination, unit_id, request);
+        let sent = checked.and_then(|()| match destination {
+            _ if !can_record() => Err(ExceptionCode::ServerDeviceFailure),
             RequestDestination::Device(route) => route
                 .ask(asker, unit_id, request)
                 .map(|pending| (Some(Arc::clone(&route.name)), pending)),
@@ -222,7 +207,7 @@ impl UnitServer {
             RequestDestination::Journal(memory) => {
                 journaled_write::submit(memory, request).map(|pending| (None, pending))
             }
-        };
+        });
         sent.inspect_err(|code| {
             self.counters.exception(*code);
             self.comm_events.send(Some(*code), false);
@@ -404,6 +389,33 @@ pub(super) fn exceeds_ranges(rights: &PeerRights, unit_id: u8, request: &[u8]) -
     rights
         .ranges(unit_id)
         .is_some_and(|ranges| Request::parse(request).is_ok_and(|request| !ranges.allow(&request)))
+}
+
+/// Checks a request to a device or a journal, before it takes room for its record.
+fn check_forwarded(
+    rights: &PeerRights,
+    destination: &RequestDestination,
+    unit_id: u8,
+    request: &[u8],
+) -> Result<(), ExceptionCode> {
+    let function_code = request.first().copied().unwrap_or_default();
+    match destination {
+        _ if !rights.allows(unit_id, function_code) => Err(NOT_ALLOWED),
+        // A gateway may put it on a line, whose devices could read it as several requests: with
+        // functions, and for units, that the peer may not use.
+        RequestDestination::Device(_) if !pdu::may_be_passed_on(request) => {
+            Err(ExceptionCode::IllegalDataValue)
+        }
+        RequestDestination::Device(_) if rights.denies(unit_id, request) => Err(NOT_ALLOWED),
+        RequestDestination::Mirror(passage) if exceeds_ranges(rights, unit_id, request) => {
+            Err(out_of_ranges(&passage.memory))
+        }
+        RequestDestination::Journal(memory) if exceeds_ranges(rights, unit_id, request) => {
+            Err(out_of_ranges(memory))
+        }
+        RequestDestination::Journal(_) => Request::parse(request).map(drop),
+        RequestDestination::Device(_) | RequestDestination::Mirror(_) => Ok(()),
+    }
 }
 
 // Not inlined, the parts of `out` are loaded before their stores are done: 2 % of a server's rate.

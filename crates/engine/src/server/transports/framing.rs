@@ -40,6 +40,8 @@ pub(crate) trait Framing: Send + Sync + 'static {
     const MAX_LEN: usize;
     /// Whether a reply names its request. Otherwise, a late one is taken for the reply to the next request.
     const HAS_IDS: bool;
+    /// Whether unit id 0 is the broadcast, as on a serial line.
+    const HAS_BROADCASTS: bool;
 
     /// What is remembered of the bytes before those that are looked at.
     type ParserState: Default + Send;
@@ -88,6 +90,7 @@ impl<const HAS_PACKETS: bool> Framing for MbapOnPort<HAS_PACKETS> {
     const MIN_FRAME_LEN: usize = mbap::HEADER_LEN + 1;
     const MAX_LEN: usize = mbap::MAX_LEN;
     const HAS_IDS: bool = true;
+    const HAS_BROADCASTS: bool = false;
 
     type ParserState = ();
 
@@ -146,6 +149,7 @@ impl Framing for Rtu {
     const MIN_FRAME_LEN: usize = 4;
     const MAX_LEN: usize = rtu::MAX_LEN;
     const HAS_IDS: bool = false;
+    const HAS_BROADCASTS: bool = true;
 
     type ParserState = rtu_stream::Requests;
 
@@ -201,6 +205,7 @@ impl Framing for Ascii {
     const MIN_FRAME_LEN: usize = 1 + 2 * 3 + 2;
     const MAX_LEN: usize = ascii::MAX_LEN;
     const HAS_IDS: bool = false;
+    const HAS_BROADCASTS: bool = true;
 
     type ParserState = ();
 

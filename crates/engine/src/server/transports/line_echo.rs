@@ -1,5 +1,15 @@
 //! What an adapter returns of the replies that are sent over it: some two-wire adapters receive what they
 //! send. As a request, it would be carried out again and again.
+//!
+//! What equals the last reply and comes next is its echo:
+//!
+//! | of the line is known | the reply differs from its request | it equals it, as of a write |
+//! | --- | --- | --- |
+//! | that it has an echo | always | always |
+//! | that it has none | if it comes in time | never |
+//! | nothing, or that an echo did not come back | if it comes in time | if it comes in time; later, [`Slow`] decides |
+//!
+//! A reply that has the form of no request is its echo in any case.
 
 use std::time::Duration;
 
@@ -13,15 +23,15 @@ const DELAY: Duration = Duration::from_millis(40);
 /// How much later an echo may come over a network, to a serial server.
 const SLOW: Duration = Duration::from_millis(250);
 
-/// As many more are carried out of a write that came again after it was taken for a slow echo.
-const REPEATED: u8 = 4;
+/// After a repeated write was dropped as an echo, so many repetitions are carried out in a row.
+const MAX_REPEATS_AFTER_DROP: u8 = 4;
 
 /// The last reply, until a request has come, and whether the line has an echo.
 #[derive(Debug, Default)]
 pub(super) struct LineEcho {
     sent: Vec<u8>,
-    /// A reply that equals its request may come again as the next request.
-    is_certain: bool,
+    /// Whether the reply differs from its request. One that equals it may come again as the next request.
+    reply_differs: bool,
     /// No request has its form: it comes back only as its echo.
     is_no_request: bool,
     until: Option<Instant>,
@@ -59,10 +69,10 @@ impl LineEcho {
     pub(super) fn sent(&mut self, request: &[u8], (reply, pdu): (&[u8], &[u8]), takes: Duration) {
         self.sent.clear();
         self.sent.extend_from_slice(reply);
-        self.is_certain = request != reply;
+        self.reply_differs = request != reply;
         let has_no_form = Request::parse(pdu) == Err(ExceptionCode::IllegalDataValue);
         let is_exception = pdu.first().is_some_and(|code| code & 0x80 != 0);
-        self.is_no_request = self.is_certain && (has_no_form || is_exception);
+        self.is_no_request = self.reply_differs && (has_no_form || is_exception);
         (self.until, self.is_soon) = (Some(Instant::now() + takes + DELAY), false);
     }
 
@@ -86,11 +96,12 @@ impl LineEcho {
         let is_echo = match self.known {
             _ if self.is_no_request => true,
             Known::Echo => true,
-            Known::NoEcho => self.is_certain && self.is_soon,
-            Known::Nothing | Known::EchoOnce if self.is_certain || self.is_soon => self.is_soon,
+            Known::NoEcho => self.reply_differs && self.is_soon,
+            Known::Nothing | Known::EchoOnce if self.is_soon => true,
+            Known::Nothing | Known::EchoOnce if self.reply_differs => false,
             Known::Nothing | Known::EchoOnce => return self.slow_echo(now),
         };
-        if self.is_certain && is_echo {
+        if self.reply_differs && is_echo {
             self.known = Known::Echo;
         }
         let len = self.sent.len();
@@ -104,7 +115,7 @@ impl LineEcho {
         self.slow = match self.slow {
             // It had no reply that could come back: the master has repeated it. That does not show that the line
             // has no echo.
-            Slow::Dropped => Slow::CarriedOut(REPEATED),
+            Slow::Dropped => Slow::CarriedOut(MAX_REPEATS_AFTER_DROP),
             _ if !is_slow => Slow::Nothing,
             Slow::Nothing => Slow::CarriedOut(0),
             Slow::CarriedOut(0) => Slow::Dropped,
@@ -129,7 +140,7 @@ impl LineEcho {
         if !self.sent.is_empty() {
             self.slow = Slow::Nothing;
         }
-        if self.is_certain && !self.sent.is_empty() {
+        if self.reply_differs && !self.sent.is_empty() {
             self.known = match self.known {
                 Known::Echo | Known::EchoOnce => Known::EchoOnce,
                 Known::Nothing | Known::NoEcho => Known::NoEcho,
@@ -279,11 +290,11 @@ mod tests {
     #[test]
     fn the_slow_echo_of_a_write_is_not_carried_out_without_end() {
         let mut echo = LineEcho::default();
-        let echoes = [1, REPEATED, REPEATED].map(|most| {
+        let echoes = [1, MAX_REPEATS_AFTER_DROP, MAX_REPEATS_AFTER_DROP].map(|most| {
             assert!(write(&mut echo, Duration::from_secs(1)), "it is no echo");
             (0..=most).take_while(|_| write(&mut echo, SLOW)).count()
         });
-        assert_eq!(echoes, [1, REPEATED, REPEATED].map(usize::from));
+        assert_eq!(echoes, [1, MAX_REPEATS_AFTER_DROP, MAX_REPEATS_AFTER_DROP].map(usize::from));
     }
 
     #[test]
@@ -291,8 +302,8 @@ mod tests {
         for later in [SLOW, MUCH_LATER] {
             let mut echo = LineEcho::default();
             let unanswered = (0..100).filter(|_| !write(&mut echo, SLOW)).count();
-            assert!(unanswered <= 100 / usize::from(REPEATED));
-            assert!((0..=REPEATED).any(|_| !write(&mut echo, SLOW)));
+            assert!(unanswered <= 100 / usize::from(MAX_REPEATS_AFTER_DROP));
+            assert!((0..=MAX_REPEATS_AFTER_DROP).any(|_| !write(&mut echo, SLOW)));
             assert!(write(&mut echo, later));
         }
     }

@@ -55,8 +55,8 @@ pub struct StreamSettings {
     pub request_timeout: Duration,
     /// With RTU frames: the silence after which an incomplete request may be followed by the next.
     pub frame_timeout: Option<Duration>,
-    /// The seconds without a byte after which the system asks whether the peer is still there.
-    pub keepalive: u16,
+    /// The time without a byte after which the system asks whether the peer is still there.
+    pub keepalive: Duration,
     pub units: UnitSettings,
     /// `None` is plain TCP.
     pub tls: Option<Arc<ServerTls>>,
@@ -95,7 +95,7 @@ impl ModbusStream {
                 request: settings.request_timeout,
                 frame: settings.frame_timeout,
             },
-            keepalive: Duration::from_secs(settings.keepalive.into()),
+            keepalive: settings.keepalive,
             framing: settings.framing,
             tls: settings.tls.clone(),
         }
