@@ -398,7 +398,12 @@ impl Ticket {
         }
     }
 
-    /// Whether rights must be looked up again. The next call returns false.
+    /// Whether rights must be looked up again.
+    pub(crate) fn is_outdated(&self) -> bool {
+        self.activity.is_outdated.load(Ordering::Acquire)
+    }
+
+    /// As [`is_outdated`](Ticket::is_outdated). The next call returns false.
     #[inline]
     pub(crate) fn take_outdated(&self) -> bool {
         self.activity.is_outdated.load(Ordering::Relaxed)

@@ -766,7 +766,10 @@ impl Service for RawIngest {
             return connection;
         };
         let mut bytes = &chunk[..len];
-        if let Ok(Packet::Whole { header, memory, payload }) = self.judge(&connection.rights, bytes)
+        // A reload may have taken place since it was accepted: then its task looks up its rights.
+        if !connection.ticket.is_outdated()
+            && let Ok(Packet::Whole { header, memory, payload }) =
+                self.judge(&connection.rights, bytes)
             && !memory.has_journal()
             && self
                 .write_at_once(context, &connection.peer.into(), (header, memory, payload))
@@ -1192,6 +1195,36 @@ mod tests {
         let mut replies = Vec::new();
         client.read_to_end(&mut replies).unwrap();
         outcome_of(&raw, &replies, &memory)
+    }
+
+    #[test]
+    fn a_packet_is_not_answered_at_once_by_the_rights_before_a_reload() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let _guard = runtime.enter();
+        let header = Header {
+            area: PacketArea::HoldingRegisters,
+            target: 1,
+            address: 0,
+            count: NonZeroU16::MIN,
+        };
+        let mut packet = vec![0; Format::V1.packet_len(&header)];
+        Format::V1.encode_to_slice(&header, &[0, 7], &mut packet).unwrap();
+        for is_reloaded in [false, true] {
+            let (mut client, accepted, peer) = connected();
+            client.write_all(&packet).unwrap();
+            while accepted.peek(&mut vec![0; packet.len()]).unwrap() < packet.len() {}
+            let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
+            let admission = Arc::new(Admission::new(limits));
+            let (ticket, _) = admission.admit(peer).unwrap();
+            let connection = Admitted { ticket, ..admitted(accepted, peer, Vec::new()) };
+            if is_reloaded {
+                admission.apply_reload(|_| None::<Kind>);
+            }
+            let raw = listener(Format::V1, Flags::Strict);
+            let connection = raw.serve_at_once(&ListenerContext::for_tests(), connection);
+            assert_eq!(connection.received == packet, is_reloaded);
+            assert_eq!(raw.packets.accepted.get(), u64::from(!is_reloaded));
+        }
     }
 
     #[test]
