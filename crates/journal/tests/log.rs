@@ -519,6 +519,7 @@ fn a_snapshot_is_also_due_by_bytes() {
     let node = Node::new(&[&server], "a", |settings| settings.snapshot_bytes = 5000);
     node.start();
     assert!(node.status().snapshot.is_some(), "the one with which the log begins");
+    let _peer = Node::started(&[&server], "peer");
     until("two snapshots are taken", || {
         node.write(0, 1).unwrap();
         first_sequence(&server) > 1
@@ -531,6 +532,8 @@ fn parts_of_a_snapshot_that_was_cut_short_are_removed() {
     let server = Server::new();
     let node = Node::new(&[&server], "a", |settings| settings.snapshot_steps = 20);
     node.start();
+    // With another node, a snapshot is stored as soon as both have the same digest.
+    let _peer = Node::started(&[&server], "peer");
     let left = "$O.holdfast-log-site.C.left";
     // Whoever sends this one may not remove the others.
     for subject in [left, "$O.holdfast-log-site.C.*"] {
@@ -563,6 +566,8 @@ fn snapshots_for_which_there_is_no_room_leave_nothing() {
     let often = |settings: &mut Settings| settings.snapshot_steps = 20;
     let node = Node::with(memory_of(65_536), &[&server], "a", often);
     node.start();
+    let peer = Node::with(memory_of(65_536), &[&server], "peer", often);
+    peer.start();
     until("a snapshot is stored", || {
         node.write(0, 1).unwrap();
         node.status().snapshot.is_some_and(|sequence| sequence > 1)

@@ -40,6 +40,9 @@ const SNAPSHOT_READ_TIMEOUT: Duration = Duration::from_secs(10);
 /// A snapshot is stored in parts of so many bytes, or of as many as the servers accept in a message.
 const MAX_PART_BYTES: usize = 128 << 10;
 
+/// How many subjects of snapshots are looked at for removal at a time: each takes a request.
+const MAX_REMOVALS: usize = 1000;
+
 /// No snapshot is longer than this.
 const MAX_SNAPSHOT_BYTES: u64 = 1 << 30;
 
@@ -377,8 +380,7 @@ impl Store {
         }
     }
 
-    /// Stores a snapshot and names it the newest, if the newest is still the one of `seen`. Removes all other
-    /// snapshots but the previous one, and the messages older than that one.
+    /// Stores a snapshot and names it the newest, if the newest is still the one of `seen`.
     pub(in crate::log) async fn put(
         &self,
         seen: Option<(u64, Pointer)>,
@@ -407,18 +409,11 @@ impl Store {
             seen.map(|(at, of)| (Some(at), Some(of.newest))).unwrap_or_default();
         let pointer = Pointer { newest: snapshot, previous };
         let revision = self.name(revision, &pointer).await?;
-        // The last snapshot may turn out to be damaged: the one before it can still be continued.
-        if let Some(previous) = &pointer.previous
-            && previous.sequence > 1
-        {
-            let purge = self.stream.purge().sequence(previous.sequence);
-            purge.await.map_err(|error| error.to_string())?;
-        }
         Ok((revision, pointer))
     }
 
-    /// Names the snapshots in the key, if the key is still of this revision, and removes all others and their
-    /// parts. Returns the new revision.
+    /// Names the snapshots in the key, if the key is still of this revision. Removes the messages older than them, and
+    /// all other snapshots and their parts. Returns the new revision.
     async fn name(&self, seen: Option<u64>, pointer: &Pointer) -> Result<u64, String> {
         let bucket = &self.stream.cached_info().config.name;
         let objects = self.context.get_stream_no_info(format!("OBJ_{bucket}")).await;
@@ -427,7 +422,9 @@ impl Store {
         // more, as its own change of the key expects the former revision.
         let stored = objects.info_with_subjects(format!("$O.{bucket}.>")).await;
         let stored = stored.map_err(|error| error.to_string())?.try_collect::<Vec<_>>().await;
-        let stored = stored.map_err(|error| error.to_string())?;
+        let mut stored = stored.map_err(|error| error.to_string())?;
+        // The name of an object before its parts: who reads it meanwhile finds it missing, not damaged.
+        stored.sort_unstable_by(|one, other| other.cmp(one));
         let value = Bytes::from(serde_json::to_vec(pointer).map_err(|error| error.to_string())?);
         let revision = match seen {
             None => self.keys.create(SNAPSHOT_KEY, value).await.map_err(|error| error.to_string()),
@@ -435,6 +432,13 @@ impl Store {
                 self.keys.update(SNAPSHOT_KEY, value, at).await.map_err(|error| error.to_string())
             }
         }?;
+        // The last snapshot may turn out to be damaged: the one before it can still be continued.
+        if let Some(previous) = &pointer.previous
+            && previous.sequence > 1
+        {
+            let purge = self.stream.purge().sequence(previous.sequence);
+            purge.await.map_err(|error| error.to_string())?;
+        }
         let mut named = Vec::new();
         for snapshot in [Some(&pointer.newest), pointer.previous.as_ref()].into_iter().flatten() {
             // A version that did not say it has named this one: its parts can't be told from others.
@@ -442,7 +446,8 @@ impl Store {
             named.push(format!("$O.{bucket}.C.{nuid}"));
             named.push(format!("$O.{bucket}.M.{}", BASE64_URL_SAFE.encode(&snapshot.object)));
         }
-        for (subject, _) in stored {
+        // Earlier releases left a marker of each snapshot: the next snapshots remove the rest.
+        for (subject, _) in stored.into_iter().take(MAX_REMOVALS) {
             // Those of somebody else may have wildcards.
             if !named.contains(&subject) && !subject.contains(['*', '>']) {
                 objects.purge().filter(subject).await.map_err(|error| error.to_string())?;
