@@ -96,6 +96,22 @@ fn values_of_a_device_have_no_age_after_a_restart() {
 }
 
 #[test]
+fn of_two_that_create_the_file_at_once_one_has_it() {
+    let path = folder("at_once").join("memories.redb");
+    let builder = redb::Database::builder();
+    // In two containers, both processes have the same number.
+    let [first, second] = [(); 2].map(|()| FileOnDisk::new(&path));
+    let database = first.create(&builder).unwrap();
+    let late = second.create(&builder).unwrap();
+    first.install().unwrap();
+    assert!(matches!(second.install(), Err(FileError::Locked)));
+    drop(late);
+    // What is there is in use: it is what the first one created.
+    assert!(matches!(second.open(&builder), Err(FileError::Locked)));
+    drop(database);
+}
+
+#[test]
 fn what_killed_processes_left_is_removed() {
     let folder = folder("left");
     let path = folder.join("memories.redb");

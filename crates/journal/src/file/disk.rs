@@ -2,6 +2,7 @@
 
 use std::fmt;
 use std::fs;
+use std::hash::{BuildHasher, RandomState};
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -64,7 +65,8 @@ const MAGIC: &[u8] = b"redb";
 #[derive(Debug)]
 pub struct FileOnDisk {
     path: PathBuf,
-    /// Is created first. The name is of this process: two that start at once don't share it.
+    /// Is created first. Its name is random: two that start at once never share it. The number of the process
+    /// would be the same in all containers that use the folder.
     beside: PathBuf,
     opened: Mutex<Option<Opened>>,
 }
@@ -84,7 +86,7 @@ impl FileOnDisk {
         let path = fs::canonicalize(path).or_else(|_| std::path::absolute(path));
         let path = path.unwrap_or_default();
         let mut beside = path.as_os_str().to_owned();
-        beside.push(format!(".{}.new", std::process::id()));
+        beside.push(format!(".{}.new", RandomState::new().hash_one(())));
         FileOnDisk { path, beside: beside.into(), opened: Mutex::default() }
     }
 
@@ -95,9 +97,9 @@ impl FileOnDisk {
         let prefix = format!("{}.", name.to_string_lossy());
         for entry in fs::read_dir(self.folder()).into_iter().flatten().flatten() {
             let found = entry.file_name();
-            let process = found.to_str().and_then(|found| found.strip_prefix(&*prefix));
-            let process = process.and_then(|rest| rest.strip_suffix(".new"));
-            if process.is_some_and(|process| process.parse::<u32>().is_ok()) {
+            let number = found.to_str().and_then(|found| found.strip_prefix(&*prefix));
+            let number = number.and_then(|rest| rest.strip_suffix(".new"));
+            if number.is_some_and(|number| number.parse::<u64>().is_ok()) {
                 let _ = fs::remove_file(entry.path());
             }
         }
