@@ -285,6 +285,25 @@ def test_a_receiver_that_can_not_be_reached_is_an_error() -> None:
         output.send(numbered(1))
 
 
+def test_connecting_does_not_hold_up_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "STOP_TIMEOUT_S", 1.0)
+    limits = []
+
+    def unreachable(_address: object, timeout: float, _source: object) -> None:
+        limits.append(timeout)
+        raise TimeoutError
+
+    monkeypatch.setattr(socket, "create_connection", unreachable)
+    output, stop = influx("http://127.0.0.1:1", bucket="b"), Stop()
+    output.use_stop(stop)
+    for _ in range(2):
+        with pytest.raises(OSError):  # noqa: PT011
+            output.send(numbered(1))
+        stop.set()
+    assert limits[0] == 3.0
+    assert all(limit <= 1.0 for limit in limits[1:])
+
+
 def test_a_receiver_without_values_shows_whether_it_can_be_reached(database: Database) -> None:
     output = influx(database.url, bucket="b")
     assert output.idle()

@@ -274,6 +274,19 @@ def test_what_is_left_at_the_end_is_sent() -> None:
     assert output.receiver.closed == 1
 
 
+def test_what_waits_after_an_outage_is_sent_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The receiver works again, and the next attempt would come after the stop."""
+    for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S"):
+        monkeypatch.setattr(module, name, 3600.0)
+    output = Running()
+    output.receiver.error = OSError("down")
+    output.buffer.offer(polls(1500))
+    wire.until(lambda: output.sender.status()["connected"] is False, "it has failed")
+    output.receiver.error = None
+    output.end()
+    assert output.receiver.sent == list(range(1500))
+
+
 def test_what_can_not_be_sent_at_the_end_is_in_the_file(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -18,12 +18,12 @@ from holdfast.net.addresses import joined
 from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, https_context
 from holdfast.outputs.line_protocol import lines
-from holdfast.outputs.sender import MAX_READINGS, Receiver, Refused, soon_after
+from holdfast.outputs.sender import MAX_READINGS, Receiver, Refused, soon_after, time_left
+from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
     from holdfast.config.models.outputs import InfluxConfig
     from holdfast.polling import Reading
-    from holdfast.runtime.stop import Stop
 
 CONNECT_TIMEOUT_S = 3.0
 """Seconds to connect, at most."""
@@ -56,7 +56,8 @@ class Influx(Receiver):
         self._settings = settings
         self._target = settings.target
         self._connection: http.client.HTTPConnection | None = None
-        self._has_ended = self._is_late = False
+        self._is_late = False
+        self._stop = Stop()
         self._most = MAX_READINGS
         """The readings of a request, at most. Less than the receiver takes after one that was too
         large."""
@@ -70,7 +71,8 @@ class Influx(Receiver):
 
     def use_stop(self, stop: Stop) -> None:
         """Ends a request that waits for its answer soon after the stop. Called before all else."""
-        soon_after(stop, self._end)
+        self._stop = stop
+        soon_after(stop, self._interrupt)
 
     def send(self, readings: list[Reading]) -> None:
         """Sends all values but those without a value. If a request is too large, in parts.
@@ -182,11 +184,6 @@ class Influx(Receiver):
         self._is_late = True
         self._interrupt()
 
-    def _end(self) -> None:
-        """Called by another thread, at the stop."""
-        self._has_ended = True
-        self._interrupt()
-
     def _interrupt(self) -> None:
         """Called by another thread: what waits for the socket gets an error."""
         connection = self._connection
@@ -197,9 +194,9 @@ class Influx(Receiver):
     def _connected(self) -> http.client.HTTPConnection:
         """The connection; a new one if there is none."""
         if self._connection is None:
-            if self._has_ended:
+            if not (left := time_left(self._stop)):
                 raise OSError("stopped")
-            connection = self._created(min(CONNECT_TIMEOUT_S, self._settings.timeout))
+            connection = self._created(min(CONNECT_TIMEOUT_S, self._settings.timeout, left))
             connection.connect()
             connection.sock.settimeout(self._settings.timeout)
             self._connection = connection

@@ -76,6 +76,11 @@ class Receiver(Protocol):
         """Plain data for diagnostics, without secrets. Called from any thread."""
 
 
+def time_left(stop: Stop) -> float:
+    """Seconds in which the receiver of an output may still take something; 0 at the end."""
+    return max(0.0, stop.at + STOP_TIMEOUT_S - time.monotonic())
+
+
 def soon_after(stop: Stop, end: Callable[[], None]) -> None:
     """Calls `end` in a thread of its own, `STOP_TIMEOUT_S` after the stop, to end a wait."""
 
@@ -275,8 +280,12 @@ class OutputSender:
             self._move_to_file(CHECK_INTERVAL_S)
 
     def _finish(self, end: float) -> None:
-        """Sends remaining readings until `end`, then moves the rest to the file."""
-        if not self._is_failing:
+        """Sends remaining readings until `end`, then moves the rest to the file.
+
+        After an outage, the receiver may work again: what would be lost is tried once more.
+        """
+        has_file = self._buffer.stored is not None and self._file_error is None
+        if not (self._is_failing and (has_file or self._is_followed())):
             while len(self._buffer) and time.monotonic() < end:
                 try:
                     self._send(self._take(0.0))

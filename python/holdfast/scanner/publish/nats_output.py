@@ -15,8 +15,9 @@ from nats.errors import Error
 from holdfast.net.event_loop import EventLoop
 from holdfast.net.nats.connection import MAX_PENDING_BYTES, nats_reason
 from holdfast.net.nats.tolerant_client import SafeClient, ServerError, as_quoted
-from holdfast.outputs.sender import Receiver, Refused, soon_after
+from holdfast.outputs.sender import Receiver, Refused, soon_after, time_left
 from holdfast.polling.faults import fault_text, is_exception
+from holdfast.runtime.stop import Stop
 from holdfast.scanner.dialects import DIALECTS
 from holdfast.scanner.messages.types import Data, Status
 from holdfast.scanner.subscriptions.tag import datatype
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from holdfast.config.values.scanner_settings import Dialect
     from holdfast.net.nats.connection import Servers
     from holdfast.polling import Reading
-    from holdfast.runtime.stop import Stop
 
 CONFIRM_TIMEOUT_S = 5.0
 """Time for the server to confirm what was sent."""
@@ -50,6 +50,7 @@ class NatsOutput(Receiver):
         self._servers, self._prefix, self._dialect = servers, prefix, DIALECTS[dialect]
         self._runner = asyncio.Runner(loop_factory=EventLoop)
         self._client: SafeClient | None = None
+        self._stop = Stop()
         self._lost: asyncio.Event | None = None
         """Set when the connection of the client has ended."""
         self._states: dict[str, str] = {}
@@ -58,6 +59,7 @@ class NatsOutput(Receiver):
 
     def use_stop(self, stop: Stop) -> None:
         """Ends a wait for the server soon after the stop. Called before all else."""
+        self._stop = stop
         soon_after(stop, self._end)
 
     def send(self, readings: list[Reading]) -> None:
@@ -154,7 +156,8 @@ class NatsOutput(Receiver):
 
             client = SafeClient(requires_tls=self._servers.secure)
             try:
-                await asyncio.wait_for(self._connect(client, is_lost), CONNECT_TIMEOUT_S)
+                seconds = min(CONNECT_TIMEOUT_S, time_left(self._stop))
+                await asyncio.wait_for(self._connect(client, is_lost), seconds)
             except BaseException:
                 await client.close()
                 raise
