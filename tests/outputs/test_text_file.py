@@ -318,6 +318,16 @@ def test_a_database_has_one_row_for_each_value(tmp_path: Path) -> None:
     assert rows[5][5] == "exception 02 (Illegal Data Address)"
 
 
+def test_a_database_can_be_read_while_it_is_open(tmp_path: Path) -> None:
+    database = SqliteFile(settings(tmp_path / "a.db", "sqlite"))
+    database.send(READINGS[:1])
+    with closing(sqlite3.connect(tmp_path / "a.db")) as other:
+        assert other.execute("SELECT tag FROM readings").fetchall() == [("t",)]
+    # Without the file that SQLite maps for a write-ahead log: a full disk would end the process.
+    assert {file.name for file in tmp_path.iterdir()} <= {"a.db", "a.db-journal"}
+    database.close()
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no open database")
 @pytest.mark.parametrize("removed", ["a.db", "a.db*"])
 def test_a_database_that_is_removed_is_made_again(tmp_path: Path, removed: str) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.outputs.buffer_file import file_errors, is_in_place
-from holdfast.outputs.sender import Receiver
+from holdfast.outputs.sender import STOP_TIMEOUT_S, Receiver
 from holdfast.outputs.text_file import row
 
 if TYPE_CHECKING:
@@ -65,9 +65,11 @@ class SqliteFile(Receiver):
         if self._status is None or not is_in_place(self._file, self._status):
             self.close()
         if self._db is None:
-            self._db = sqlite3.connect(self._file, timeout=5.0, check_same_thread=False)
+            self._db = sqlite3.connect(self._file, timeout=STOP_TIMEOUT_S, check_same_thread=False)
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
-            self._db.execute("PRAGMA journal_mode=WAL")
+            # A write-ahead log would have a file in shared memory, for which SQLite takes no room
+            # on the disk: if that is full, the process ends at a page of it, by SIGBUS.
+            self._db.execute("PRAGMA journal_mode=TRUNCATE")
             self._db.executescript(_CREATE)
             self._status = self._file.stat()
         return self._db
