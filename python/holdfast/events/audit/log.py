@@ -71,6 +71,8 @@ class Audit:
         self._waiting: list[Record] = []
         self._group = Group()
         self._failing = self._is_closed = False
+        self._reasons: set[str] = set()
+        """Why the file could not be written, since it began to fail."""
         self._on_failing: Callable[[bool], object] = lambda _: None
         for each in copies:
             each.start()
@@ -164,8 +166,8 @@ class Audit:
                 self._file.check()
                 if puts_aside and not self._file.is_empty:
                     self._file.rotate()
-            except OSError:
-                self._note_failure()
+            except OSError as error:
+                self._note_failure(error)
 
     @property
     def failing(self) -> bool:
@@ -214,8 +216,8 @@ class Audit:
         if self._file is not None:
             try:
                 self._file.check()
-            except OSError:
-                self._note_failure()
+            except OSError as error:
+                self._note_failure(error)
                 return 0
             if self._file.broken is not None:
                 reports.append({"event": BREAK, **self._file.broken})
@@ -243,8 +245,8 @@ class Audit:
             try:
                 for count in self._file.append(lines, together=together):
                     written += count
-            except OSError:
-                self._note_failure()
+            except OSError as error:
+                self._note_failure(error)
             else:
                 self._set_failing(False)
         if written:
@@ -262,15 +264,18 @@ class Audit:
         self._lost_unreported += len(records)
         self._send([unchained(record) for record in records])
 
-    def _note_failure(self) -> None:
-        """Logs the current exception, and marks the log as failing."""
+    def _note_failure(self, error: OSError) -> None:
+        """Marks the log as failing, and logs each new reason."""
         assert self._file is not None
-        log_lines.problem("audit_failed", file=str(self._file.file))
+        if str(error) not in self._reasons:
+            self._reasons.add(str(error))
+            log_lines.problem("audit_failed", file=str(self._file.file))
         self._set_failing(True)
 
     def _set_failing(self, failing: bool) -> None:
         if failing != self._failing:
             self._failing = failing
             if not failing:
+                self._reasons.clear()
                 log_lines.write(logging.INFO, "audit_back", lost=self._lost_unreported)
             self._on_failing(failing)
