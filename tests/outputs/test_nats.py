@@ -136,6 +136,10 @@ def test_nothing_is_lost_when_the_server_is_away(
             'Permissions Violation for Publish to "modbus.data.big"',
         ),
         ("max_payload: 512", r"modbus.data.big: found \d+ bytes, the server takes 512"),
+        (
+            'accounts: {A: {users: [{user: u, password: ""}], limits: {max_payload: 512}}}',
+            r"modbus.data.big: found \d+ bytes, the server takes 512",
+        ),
     ],
 )
 def test_a_value_that_the_server_does_not_take_is_refused_alone(

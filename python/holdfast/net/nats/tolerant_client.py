@@ -387,6 +387,11 @@ class SafeClient(Client):
         task = self._reconnection_task
         return self.is_reconnecting and task is not None and task.done()
 
+    async def connect(self, *args: Any, **options: Any) -> None:
+        """Connects, and learns the limits of the account, which come after the first answer."""
+        await super().connect(*args, **options)
+        await self.flush(self.options["connect_timeout"])
+
     async def flush(self, timeout: int = DEFAULT_FLUSH_TIMEOUT) -> None:
         """Waits until the server has all that was sent, and has answered it.
 
@@ -421,7 +426,11 @@ class SafeClient(Client):
         await self._error_cb(self._err)
 
     async def _process_info(self, info: dict[str, Any], initial_connection: bool = False) -> None:
-        """Takes the servers of the cluster in place of those listed before, which nats-py keeps."""
+        """Takes limits that have changed, which nats-py ignores, and the servers of the cluster in
+        place of those listed before, which it keeps.
+        """
+        if isinstance(max_payload := info.get("max_payload"), int):
+            self._max_payload = max_payload
         if listed := info.get("connect_urls"):
             self._server_pool[:] = [
                 each
