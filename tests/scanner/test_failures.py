@@ -111,6 +111,8 @@ def test_a_client_that_nats_throws_out_is_replaced(
     # A text that is no command: the server says so and closes, and nats-py gives up for good.
     scanner.do(_nonsense(scanner.scanner))
     wire.until(lambda: events(caplog).count("nats_connected") == 2, "there is another client")
+    [lost] = logged(caplog, "nats_disconnected")
+    assert lost["reason"] == "the server ended the connection: Unknown Protocol Operation"
     data.take()
     assert data.next()["value"] == 0
     wire.until(lambda: scanner.serves, "requests reach it")

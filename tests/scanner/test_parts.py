@@ -15,7 +15,7 @@ from nats.aio.msg import Msg
 from holdfast.client.url import NetworkTarget
 from holdfast.net.nats import batch
 from holdfast.net.nats import outbox as outboxes
-from holdfast.net.nats.connection import NatsConnection, Ping, Servers
+from holdfast.net.nats.connection import MAX_PAUSE_S, NatsConnection, Ping, Servers
 from holdfast.net.nats.outbox import Outbox
 from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.scanner import responder
@@ -430,6 +430,16 @@ def test_an_error_of_the_server_is_logged_once_and_as_it_is_spelled(
     assert [each["reason"] for each in logged(caplog, "nats_error")] == [
         f"nats: {each}" for each in reasons[1:3]
     ]
+
+
+def test_a_server_that_ends_each_connection_is_asked_less_and_less_often() -> None:
+    client = SafeClient()
+    client.options = {}
+    broker = NatsConnection(Servers(), {}, lambda _: None, Ping(), name="test")
+    for _ in range(10):
+        broker._note_connected(client)
+        broker._note_lost("tested")
+    assert client.options["reconnect_time_wait"] >= 0.75 * MAX_PAUSE_S
 
 
 def test_messages_flow_in_order_while_they_are_taken() -> None:

@@ -28,7 +28,7 @@ from holdfast.net.secret_file import read_secret
 from holdfast.net.secure_channel import SecureChannel, failure_text
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.runtime import tasks
-from holdfast.runtime.backoff import Backoff
+from holdfast.runtime.backoff import PROVEN_S, Backoff
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -131,8 +131,11 @@ class NatsConnection:
     """Seconds between attempts to connect."""
 
     def __post_init__(self) -> None:
-        self._backoff = Backoff(FIRST_PAUSE_S, self.max_pause_s, jitter=True)
-        self._first_pause_s = self._pause_s = min(FIRST_PAUSE_S, self.max_pause_s)
+        self._backoff = Backoff(FIRST_PAUSE_S, self.max_pause_s, jitter=True, proven_s=PROVEN_S)
+        self._pause_s = min(FIRST_PAUSE_S, self.max_pause_s)
+        self._failed_attempts = 0
+        """Attempts to connect that have failed since there was a connection."""
+        self._connected_at = 0.0
         self._logged_failure = ("", 0.0)
         self._worked = False
         self.client: SafeClient | None = None
@@ -179,7 +182,7 @@ class NatsConnection:
 
         async def lost() -> None:
             if self.client is client:
-                self._note_lost("the connection was lost")
+                self._note_lost(client.loss_reason)
 
         async def again() -> None:
             if not ended.is_set():
@@ -200,8 +203,8 @@ class NatsConnection:
                 reconnected_cb=again,
                 closed_cb=closed,
                 max_reconnect_attempts=-1,
-                reconnect_time_wait=self._pause_s,  # type: ignore[arg-type]
-                ping_interval=self.ping.interval,  # type: ignore[arg-type]
+                reconnect_time_wait=self._pause_s,
+                ping_interval=self.ping.interval,
                 max_outstanding_pings=self.ping.outstanding,
                 pending_size=MAX_PENDING_BYTES,
             )
@@ -215,7 +218,7 @@ class NatsConnection:
             await _given_up(client, ended)
         finally:
             listening.cancel()
-        self._note_lost("the connection was lost")
+        self._note_lost(client.loss_reason)
 
     async def _listen(self, client: SafeClient, ended: asyncio.Event) -> None:
         """Subscribes to all subjects. Sets `ended` on failure."""
@@ -246,18 +249,19 @@ class NatsConnection:
             logging.INFO,
             "nats_connected",
             server="" if url is None else f"{url.hostname}:{url.port}",
-            attempts=self._backoff.failures + 1,
+            attempts=self._failed_attempts + 1,
         )
         self._logged_failure, self._worked = ("", 0.0), True
-        self._backoff.succeeded()
-        self._pause_s = client.options["reconnect_time_wait"] = self._first_pause_s
+        self._failed_attempts, self._connected_at = 0, time.monotonic()
         self.client = client
         self.connected(client)
 
     def _note_lost(self, reason: str) -> None:
-        if self.client is None:
+        client, self.client = self.client, None
+        if client is None:
             return
-        self.client = None
+        # A server may end each connection at once.
+        self._pause(client, time.monotonic() - self._connected_at)
         self.connected(None)
         level = logging.INFO if reason == "stopped" else logging.WARNING
         log_lines.write(level, "nats_disconnected", reason=reason)
@@ -266,15 +270,20 @@ class NatsConnection:
         """Logs an error. Without a connection, the error is a failed attempt to connect."""
         reason, now = failure_text(error), time.monotonic()
         if self.client is None:
-            self._pause_s = client.options["reconnect_time_wait"] = self._backoff.failed()
+            self._failed_attempts += 1
+            self._pause(client, 0.0)
         if reason == self._logged_failure[0] and now - self._logged_failure[1] < LOG_INTERVAL_S:
             return
         self._logged_failure = (reason, now)
         if self.client is not None:
             log_lines.refused("nats_error", kind="nats", reason=reason)
             return
-        attempts = self._backoff.failures
+        attempts = self._failed_attempts
         log_lines.write(logging.WARNING, "nats_connect_failed", reason=reason, attempts=attempts)
+
+    def _pause(self, client: Client, worked_s: float) -> None:
+        """Sets the pause before the next attempt, after a connection that worked for that long."""
+        self._pause_s = client.options["reconnect_time_wait"] = self._backoff.failed(worked_s)
 
 
 def _except_answers(handler: Handler) -> Handler:
@@ -330,8 +339,8 @@ async def connected_once(
                     max_reconnect_attempts=1,
                     reconnect_time_wait=0,
                     # A server that does not answer leaves time for the others.
-                    connect_timeout=within_s / len(servers.urls),  # type: ignore[arg-type]
-                    ping_interval=PING_INTERVAL_S,  # type: ignore[arg-type]
+                    connect_timeout=within_s / len(servers.urls),
+                    ping_interval=PING_INTERVAL_S,
                     max_outstanding_pings=PINGS_OUTSTANDING,
                 )
         except (Error, OSError) as error:

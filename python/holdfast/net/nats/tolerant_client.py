@@ -55,6 +55,9 @@ MAX_CLUSTER_SERVERS = 64
 """The most servers that are taken from the list of a cluster. Clusters have at most a dozen."""
 
 
+CONNECTION_LOST = "the connection was lost"
+
+
 class ServerError(Error):
     """An error that the server reports and after which the connection goes on.
 
@@ -380,6 +383,8 @@ class SafeClient(Client):
         self.transport = MessageTransport(self._deliver, self._heard, requires_tls=requires_tls)
         self._transport = self.transport
         self.msg_class = self._with_age  # type: ignore[assignment]
+        self.loss_reason = CONNECTION_LOST
+        """Why the connection has ended: in the words of the server, if it has said so."""
 
     @property
     def has_stopped_reconnecting(self) -> bool:
@@ -420,10 +425,16 @@ class SafeClient(Client):
     async def _process_err(self, err_msg: str) -> None:
         text = self.transport.errors.popleft()
         if PERMISSIONS_ERR not in err_msg:
+            # nats-py ends the connection without a word of it.
+            self.loss_reason = f"the server ended the connection: {text}"
             await super()._process_err(err_msg)
             return
         self._err = ServerError(f"nats: {text}")
         await self._error_cb(self._err)
+
+    async def _process_connect_init(self) -> None:
+        self.loss_reason = CONNECTION_LOST
+        await super()._process_connect_init()
 
     async def _process_info(self, info: dict[str, Any], initial_connection: bool = False) -> None:
         """Takes limits that have changed, which nats-py ignores, and the servers of the cluster in

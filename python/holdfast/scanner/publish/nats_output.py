@@ -136,7 +136,7 @@ class NatsOutput(Receiver):
             while not flushing.done():
                 # nats-py does not call `disconnected_cb` if it fails to send the last bytes.
                 if losing.done() or client.is_closed:
-                    raise ConnectionError("the connection was lost")
+                    raise ConnectionError(client.loss_reason)
                 await asyncio.wait(
                     {flushing, losing},
                     timeout=CHECK_INTERVAL_S,
