@@ -211,6 +211,11 @@ def test_text_that_is_not_utf_8_is_refused_without_a_position(memory_access: Mem
     assert caught.value.detail == "not JSON: a string is not UTF-8"
 
 
+def test_a_byte_order_mark_is_named(memory_access: MemoryAccess) -> None:
+    with pytest.raises(Refused, match="byte order mark"):
+        memory_access.ingest(b"\xef\xbb\xbf{}", GRANT, "-")
+
+
 def test_reasons_beyond_a_limit_are_counted_together(memory_access: MemoryAccess) -> None:
     """An adapter of another package may make its reasons from what it receives."""
     for number in [*range(100), 0, 99]:

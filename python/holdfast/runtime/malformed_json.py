@@ -11,4 +11,7 @@ MALFORMED_JSON = (msgspec.DecodeError, UnicodeDecodeError, RecursionError)
 def malformed_text(error: Exception) -> str:
     """Returns what is wrong, for people."""
     # The position in the error counts from the start of the string, not of the document.
-    return "a string is not UTF-8" if isinstance(error, UnicodeDecodeError) else str(error)
+    text = "a string is not UTF-8" if isinstance(error, UnicodeDecodeError) else str(error)
+    if text.endswith("invalid character (byte 0)"):
+        text += ": it may be a byte order mark, which is not shown"
+    return text
