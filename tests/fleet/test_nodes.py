@@ -605,6 +605,16 @@ def test_deletions_end_in_a_bucket_that_was_made_without_ttls(
     assert (found.headers or {})["Nats-TTL"] == "3600s"
 
 
+def test_a_bucket_that_loses_subscriptions_is_refused(
+    node: Callable[..., Running], caller: Caller, caplog: pytest.LogCaptureFixture
+) -> None:
+    caller.do(caller.client.jetstream().create_key_value(bucket=WANTS, ttl=3600))
+    running = node("a", wait=False)
+    wire.until(lambda: logged(caplog, "fleet_unavailable"), "it is logged")
+    assert "TTL of 3600 s" in logged(caplog, "fleet_unavailable")[0]["reason"]
+    assert not member_of(running.scanner).is_joined
+
+
 def test_many_devices_are_browsed_in_pages(
     node: Callable[..., Running],
     caller: Caller,

@@ -469,6 +469,15 @@ def test_a_bucket_that_is_lost_is_written_again(
     wire.until(lambda: len(own_caller.kept(BUCKET)) == 2, "both entries are there again")
 
 
+def test_a_bucket_that_loses_entries_keeps_nothing(
+    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, caplog: pytest.LogCaptureFixture
+) -> None:
+    own_caller.do(own_caller.client.jetstream().create_key_value(bucket=BUCKET, ttl=3600))
+    run_scanner(own_nats)
+    wire.until(lambda: logged(caplog, "subscriptions_not_kept"), "it is logged")
+    assert "TTL of 3600 s" in logged(caplog, "subscriptions_not_kept")[0]["reason"]
+
+
 def test_jetstream_that_fails_holds_no_request_up_and_gets_everything_later(
     run_scanner: Run,
     tmp_path: Path,

@@ -81,6 +81,14 @@ async def create_stream(jetstream: JetStreamContext, config: StreamConfig, repli
             raise
 
 
+def check_keys_stay(stream: StreamConfig) -> None:
+    """Raises `Error` for a bucket whose keys end by themselves: somebody has made it with a TTL."""
+    if stream.max_age:
+        bucket = (stream.name or "").removeprefix("KV_")
+        flaw = f"the bucket {bucket} has a TTL of {stream.max_age:g} s, which removes entries"
+        raise Error(f"{flaw}: nats kv edit {bucket} --ttl=0")
+
+
 class KeyBucket:
     """Keys over one connection. Every change names the revision that it replaces."""
 

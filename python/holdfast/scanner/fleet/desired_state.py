@@ -15,7 +15,7 @@ from nats.errors import Error
 
 from holdfast.config.values.scanner_settings import WANTS
 from holdfast.events import log_lines
-from holdfast.net.nats.key_bucket import OPERATION_HEADER, KeyBucket, Outdated
+from holdfast.net.nats.key_bucket import OPERATION_HEADER, KeyBucket, Outdated, check_keys_stay
 from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms
 
@@ -111,11 +111,13 @@ class DesiredState:
     ) -> None:
         """Makes the bucket, agrees on the terms, and begins to follow the values.
 
-        Raises `FleetRefused` if other terms are in force, and errors of nats-py.
+        Raises `FleetRefused` if other terms are in force, and errors of nats-py, also for a bucket
+        that loses subscriptions.
         """
         if self._bucket is None or self._bucket.client is not client:
             self._bucket = KeyBucket(client, self.bucket, TIMEOUT_S, TIMEOUT_S)
         found = await self._bucket.make(3, self._latest, allow_msg_ttl=True)
+        check_keys_stay(found.config)
         if not found.config.allow_msg_ttl:  # Before deletions had an end.
             await self._bucket.allow_ttls(found.config)
         self._identify(str(found.created), found.state.last_seq)

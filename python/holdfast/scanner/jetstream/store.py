@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from nats.js.errors import NotFoundError
 
 from holdfast.events import log_lines
+from holdfast.net.nats.key_bucket import check_keys_stay
 from holdfast.net.nats.outbox import USUAL_MAX_PAYLOAD_BYTES
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
@@ -170,12 +171,13 @@ class EntryStore:
         self._has_work.clear()
 
     async def _read(self, client: Client) -> KeyValue:
-        """Opens the bucket and reports its entries."""
+        """Opens the bucket and reports its entries. Raises an error if it would lose them."""
         jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
         try:
             bucket = await jetstream.key_value(BUCKET)
         except NotFoundError:
             bucket = await jetstream.create_key_value(bucket=BUCKET, history=1)
+        check_keys_stay((await jetstream.stream_info(STREAM)).config)
         entries = []
         for keys in (f"{subscription_keys(self._prefix)}*.*.*", f"{status_keys(self._prefix)}*"):
             async with reading(jetstream, BUCKET, keys) as reader:
