@@ -469,6 +469,24 @@ def test_a_bucket_that_is_lost_is_written_again(
     wire.until(lambda: len(own_caller.kept(BUCKET)) == 2, "both entries are there again")
 
 
+@pytest.mark.parametrize("is_made_again", [False, True])
+def test_a_bucket_that_is_deleted_is_written_again(
+    run_scanner: Run,
+    caller: Caller,
+    server: holdfast.Server,
+    monkeypatch: pytest.MonkeyPatch,
+    is_made_again: bool,
+) -> None:
+    monkeypatch.setattr(store, "CHECK_INTERVAL_S", 0.1)
+    run_scanner()
+    assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
+    wire.until(lambda: len(caller.kept(BUCKET)) == 2, "both entries are there")
+    caller.forget(BUCKET)
+    if is_made_again:
+        caller.put(BUCKET, "another", "1")
+    wire.until(lambda: len(subscriptions(caller)) == 1, "the subscription is there again")
+
+
 def test_a_bucket_that_loses_entries_keeps_nothing(
     run_scanner: Run, own_nats: NatsServer, own_caller: Caller, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -45,6 +46,9 @@ KEY_SUBJECTS = f"$KV.{BUCKET}."
 
 MAX_CONCURRENT_WRITES = 16
 """Subscriptions that are written at once."""
+
+CHECK_INTERVAL_S = 10.0
+"""Between looks whether the bucket was deleted or replaced, which NATS does not tell."""
 
 
 class EntryStore:
@@ -89,6 +93,9 @@ class EntryStore:
         self._availability = Availability(*events, bucket=BUCKET)
         self._backoff = Backoff(FIRST_RETRY_S, MAX_RETRY_S, jitter=True)
         self._pause_s = 0.0
+        self._made_at = ""
+        """When the bucket was made that was read last."""
+        self._checked_at = 0.0
         self._busy = asyncio.Lock()
         """Held while entries are read or written."""
         self.tried = asyncio.Event()
@@ -137,7 +144,7 @@ class EntryStore:
                 continue
             try:
                 async with self._busy:
-                    if bucket is None:
+                    if bucket is None or not await self._is_same(client):
                         bucket = await self._read(client)
                     await self._write(client.jetstream(timeout=JETSTREAM_TIMEOUT_S), bucket)
             except Exception as error:  # Keeping is optional, no error may stop the scanner.
@@ -167,8 +174,16 @@ class EntryStore:
             except TimeoutError:
                 pass
             return
-        await self._has_work.wait()
+        await tasks.within(CHECK_INTERVAL_S, self._has_work.wait())
         self._has_work.clear()
+
+    async def _is_same(self, client: Client) -> bool:
+        """Whether the bucket is still the one that was read. Raises an error if there is none."""
+        if time.monotonic() < self._checked_at + CHECK_INTERVAL_S:
+            return True
+        found = await client.jetstream(timeout=JETSTREAM_TIMEOUT_S).stream_info(STREAM)
+        self._checked_at = time.monotonic()
+        return str(found.created) == self._made_at
 
     async def _read(self, client: Client) -> KeyValue:
         """Opens the bucket and reports its entries. Raises an error if it would lose them."""
@@ -177,7 +192,9 @@ class EntryStore:
             bucket = await jetstream.key_value(BUCKET)
         except NotFoundError:
             bucket = await jetstream.create_key_value(bucket=BUCKET, history=1)
-        check_keys_stay((await jetstream.stream_info(STREAM)).config)
+        made = await jetstream.stream_info(STREAM)
+        check_keys_stay(made.config)
+        self._made_at, self._checked_at = str(made.created), time.monotonic()
         entries = []
         for keys in (f"{subscription_keys(self._prefix)}*.*.*", f"{status_keys(self._prefix)}*"):
             async with reading(jetstream, BUCKET, keys) as reader:
