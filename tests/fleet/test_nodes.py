@@ -22,7 +22,7 @@ from holdfast.net.nats.key_bucket import Outdated
 from holdfast.net.nats.outbox import Outbox
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.scanner.errors import Refused
-from holdfast.scanner.fleet import desired_state, reports
+from holdfast.scanner.fleet import desired_state, placement, reports
 from holdfast.scanner.fleet.agreement import FleetRefused
 from holdfast.scanner.service import Scanner
 from holdfast.scanner.settings import FleetSettings, Settings
@@ -974,6 +974,26 @@ def test_one_node_or_all_are_shut_down(node: Callable[..., Running], caller: Cal
     wire.until(two.ended.done, "the other node ends")
     with pytest.raises((NoAnswer, Exception)):
         caller.request("modbus.browse", "")
+
+
+def test_a_node_with_another_jetstream_is_another_scanner(
+    node: Callable[..., Running], caller: Caller, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As over a leaf node, which passes on messages, but not what is stored."""
+    running = node("a")
+    share(running)
+    own = member_of(running.scanner).desired.made_at
+
+    def others(started: int, **more: str) -> list[dict[str, int]]:
+        caller.publish("modbus.scanner", json.dumps({"startedAt": started, "fleet": FLEET} | more))
+        service = caller.request("modbus.browse", "")["service"]
+        found: list[dict[str, int]] = service.get("otherScanners", [])
+        return found
+
+    assert others(1) == others(2, bucket=own) == []
+    assert others(3, bucket="another") == [], "this node may not have found a new one yet"
+    monkeypatch.setattr(placement, "FIND_BUCKET_S", 0.0)
+    assert others(3, bucket="another") == [{"startedAt": 3}]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ import asyncio
 from typing import TYPE_CHECKING, Protocol, TypeAlias, TypeVar
 
 from holdfast.net.nats.outbox import Outbox
+from holdfast.scanner.messages.types import Announcement
 
 if TYPE_CHECKING:
     from collections.abc import (
@@ -133,7 +134,6 @@ class LocalReports(ReportHandlers, Protocol):
 class Placement:
     """Polls all devices, and stores no subscriptions. Subclasses override what differs."""
 
-    fleet_name: str | None = None
     queue_group = ""
     """The NATS queue group of `shared_subjects`; empty without a fleet."""
     shared_subjects: Sequence[str] = ()
@@ -271,6 +271,14 @@ class Placement:
     @property
     def has_others(self) -> bool:
         """Whether other nodes go on when this one ends."""
+        return False
+
+    def announcement(self, started: int, /) -> Announcement:
+        """Returns what others are told of this scanner."""
+        return Announcement(started_at=started)
+
+    def shares_devices(self, _other: Announcement, /) -> bool:
+        """Whether another scanner shares its devices with this one, so that it is no competitor."""
         return False
 
     def report(self) -> FleetReport | None:

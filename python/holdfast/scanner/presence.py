@@ -59,7 +59,10 @@ class OtherScanners:
             return False
         self._seen[started] = now
         if is_new:
-            todo = "stop one of them, or give it another --prefix"
+            todo = (
+                "stop one of them, or give it another --prefix; "
+                "nodes of one fleet must use the same JetStream"
+            )
             log_lines.limited(
                 logging.WARNING,
                 "another_scanner",
@@ -122,8 +125,7 @@ class Presence:
         """Handles the announcement of another scanner, or of this one."""
         with contextlib.suppress(*MALFORMED_JSON):
             other = msgspec.json.decode(message.data, type=Announcement)
-            # The nodes of a fleet share their devices: they are no competitors.
-            if other.fleet is None or other.fleet != self._placement.fleet_name:
+            if not self._placement.shares_devices(other):
                 self._saw(other.started_at)
 
     def _saw(self, started: int) -> None:
@@ -131,7 +133,7 @@ class Presence:
             self._announce()  # The other one may have been started later, and not know this one.
 
     def _announce(self) -> None:
-        content = Announcement(started_at=self.heartbeat.started, fleet=self._placement.fleet_name)
+        content = self._placement.announcement(self.heartbeat.started)
         if self._client() is not None:
             self._outbox.put([((self._subject,), batch.message(self._subject, content))])
 

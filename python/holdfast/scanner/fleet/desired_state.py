@@ -95,7 +95,8 @@ class DesiredState:
         """The devices that the bucket may not have any more, as the deletion has ended there."""
         self._is_shown = False
         """Whether the bucket has shown all that it has, since it is followed."""
-        self._made_at = ""
+        self.made_at = ""
+        """When the bucket was made: another one of this name was made at another time."""
         self._former: dict[str, _Former] = {}
         """The values of a lost bucket that are not stored again yet."""
         self.is_read = asyncio.Event()
@@ -134,7 +135,7 @@ class DesiredState:
 
     def _identify(self, made_at: str, last: int) -> None:
         """Notes that the bucket is another one, or was set back, and that its values are lost."""
-        before, self._made_at = self._made_at, made_at
+        before, self.made_at = self.made_at, made_at
         if not before or (before == made_at and last >= self._latest):
             return
         self._former |= {
@@ -187,7 +188,7 @@ class DesiredState:
         if bucket is None or bucket.following is None:
             return False
         info = await bucket.info()
-        if str(info.created) != self._made_at or info.state.last_seq < self._latest:
+        if str(info.created) != self.made_at or info.state.last_seq < self._latest:
             return False
         await bucket.following.consumer_info()  # Its server may have ended.
         return True
@@ -241,13 +242,13 @@ class DesiredState:
 
         Raises `Outdated` and errors of nats-py.
         """
-        value, made_at = b"" if desired is None else msgspec.json.encode(desired), self._made_at
+        value, made_at = b"" if desired is None else msgspec.json.encode(desired), self.made_at
         try:
             stored = await self._put(DEVICE + _token(device), value, revision)
         except Outdated:
             self._doubted.add(device)
             raise
-        if made_at != self._made_at:
+        if made_at != self.made_at:
             raise Outdated(device)
         self._learn(device, stored, value)
         return stored

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from typing import TYPE_CHECKING, Any
 
 from holdfast import _core
@@ -15,7 +16,7 @@ from holdfast.scanner.fleet.member import FleetMember
 from holdfast.scanner.fleet.nodes import NodeAnswers, OtherNodes
 from holdfast.scanner.fleet.questions import subject
 from holdfast.scanner.fleet.reports import FleetReports
-from holdfast.scanner.messages.types import Answer, FleetReport
+from holdfast.scanner.messages.types import Announcement, Answer, FleetReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -37,6 +38,12 @@ if TYPE_CHECKING:
     from holdfast.scanner.subscriptions.registry import Registry
     from holdfast.scanner.subscriptions.tag import ScannedTag
 
+FIND_BUCKET_S = 15.0
+"""Seconds in which all nodes have found the bucket that is made in place of a lost one."""
+
+MAX_OTHER_BUCKETS = 100
+"""Limit of remembered buckets of others."""
+
 
 class FleetPlacement(FleetMember):
     """The placement of a scanner that is a node of a fleet, see `Placement`."""
@@ -51,7 +58,8 @@ class FleetPlacement(FleetMember):
         """`start_thread` starts the thread of the leases."""
         self._settings = settings
         self._prefix = settings.prefix
-        self.fleet_name = fleet_settings.name
+        self._other_buckets: dict[str, float] = {}
+        """When other buckets of subscriptions of the same name were first heard of."""
         self.queue_group = f"holdfast-{fleet_settings.name}"
         names = ("subscribe", "unsubscribe", "command.>", "browse", "variables")
         self.shared_subjects = [f"{settings.prefix}.{name}" for name in names]
@@ -96,6 +104,26 @@ class FleetPlacement(FleetMember):
     def has_others(self) -> bool:
         """Whether other nodes go on when this one ends."""
         return self.partition_leases.has_others
+
+    def announcement(self, started: int, /) -> Announcement:
+        """Returns what other scanners are told of this one."""
+        fleet = self.partition_leases.settings.name
+        return Announcement(started_at=started, fleet=fleet, bucket=self.desired.made_at)
+
+    def shares_devices(self, other: Announcement, /) -> bool:
+        """Whether another scanner is a node of this fleet.
+
+        Two JetStreams have two fleets of the same name, which know nothing of each other.
+        """
+        if other.fleet != self.partition_leases.settings.name:
+            return False
+        own, now = self.desired.made_at, time.monotonic()
+        if not own or other.bucket in ("", own):
+            self._other_buckets.pop(own, None)
+            return True
+        if len(self._other_buckets) >= MAX_OTHER_BUCKETS:
+            self._other_buckets.clear()
+        return now < self._other_buckets.setdefault(other.bucket, now) + FIND_BUCKET_S
 
     def report(self) -> FleetReport:
         """Returns what `browse` reports of the fleet."""

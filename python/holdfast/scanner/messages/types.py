@@ -237,6 +237,8 @@ class Announcement(_Message, omit_defaults=True):
     """In milliseconds since 1970."""
     fleet: str | None = None
     """The fleet that the scanner is a node of."""
+    bucket: Annotated[str, Meta(max_length=64)] = ""
+    """When the bucket of the fleet's subscriptions was made, if that is known."""
 
 
 class Variable(_Message, omit_defaults=True):
