@@ -125,7 +125,7 @@ class Bucket:
 
     async def make(self, *_: int, **settings: bool) -> Any:
         state = SimpleNamespace(last_seq=self._revision)
-        config = SimpleNamespace(**settings)
+        config = SimpleNamespace(**settings, max_age=0.0)
         return SimpleNamespace(created=self.number, state=state, config=config)
 
     async def publish(self, key: str, value: bytes, _: int, __: dict[str, str]) -> int:
