@@ -218,6 +218,24 @@ def test_what_waits_longer_than_others_is_late() -> None:
     assert [buffer.has_late(), buffer.has_late()] == [False, True]
 
 
+def test_readings_are_numbered_in_the_order_in_which_they_leave(
+    opened: Opened, tmp_path: Path
+) -> None:
+    buffer = Buffer(4)
+    buffer.stored = opened(tmp_path / "b.db")
+    buffer.offer(polls(2))
+    buffer.keep(60)
+    buffer.offer(polls(3, 2))
+    assert (buffer.first_number, buffer.next_number) == (0, 5)
+    buffer.take(1, 0)
+    assert (buffer.first_number, buffer.next_number) == (0, 5)
+    while (batch := buffer.take(1, 0)) != []:
+        assert buffer.first_number == numbers(batch)[0]
+        buffer.done()
+    buffer.offer(polls(6, 5))
+    assert (buffer.first_number, buffer.next_number, numbers(buffer.take(1, 0))) == (7, 11, [7])
+
+
 def test_what_was_taken_from_the_file_is_taken_again_after_a_crash(
     opened: Opened, tmp_path: Path
 ) -> None:

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from holdfast.config.models.outputs import SparkplugConfig
-from holdfast.outputs import Refused
+from holdfast.outputs import Buffer, Refused
 from holdfast.outputs.sparkplug.datatypes import datatype_of, value_of
 from holdfast.outputs.sparkplug.definition import Metric, parsed
 from holdfast.outputs.sparkplug.node import EdgeNode, Names
@@ -47,9 +47,9 @@ def latest(*readings: Reading) -> dict[str, dict[str, Reading]]:
     return found
 
 
-def node(*readings: Reading) -> EdgeNode:
-    """A node in a session, with a device of these current values."""
-    made = EdgeNode(Names("group", "edge"))
+def node(*readings: Reading, waiting: int = 0) -> EdgeNode:
+    """A node in a session, with a device of these current values, and so many that wait."""
+    made = EdgeNode(Names("group", "edge"), lambda: waiting)
     made.begin()
     made.adopt({"pump": [SPEED, LEVEL]}, {})
     list(made.births({"pump": True}, lambda: latest(*readings)))
@@ -285,11 +285,11 @@ def test_types_of_metrics(tag: Tag, expected: str) -> None:
 )
 def test_unsigned_integers_of_32_bits_are_long(type: str, field: str) -> None:
     tag = Tag("speed", "input_registers", 0, type)
-    made = EdgeNode(Names("group", "edge"))
+    made = EdgeNode(Names("group", "edge"), int)
     made.begin()
     made.adopt({"pump": [tag]}, {})
     *_, birth = made.births({"pump": True}, lambda: latest(reading(7, 1.0, tag)))
-    [data] = made.data([reading(8, 2.0, tag)], latest)
+    [data] = made.data([reading(8, 2.0, tag)], latest, 0)
     for message, value in ((birth, 7), (data, 8)):
         [metric] = payload(message).metrics
         assert metric.HasField(field)
@@ -298,13 +298,13 @@ def test_unsigned_integers_of_32_bits_are_long(type: str, field: str) -> None:
 
 @pytest.mark.parametrize("always_typed", [False, True])
 def test_data_has_types_if_they_are_always_wanted(always_typed: bool) -> None:
-    made = EdgeNode(Names("group", "edge"), always_typed=always_typed)
+    made = EdgeNode(Names("group", "edge"), int, always_typed=always_typed)
     made.begin()
     made.adopt({"pump": [SPEED]}, {})
     *_, birth = made.births({"pump": True}, lambda: latest(reading(0, 10.0)))
     found = [payload(birth).metrics[0]]
     for some in (reading(3, 8.0), reading(5, 11.0), reading(None, 12.0, fault=2)):
-        [message] = made.data([some], latest)
+        [message] = made.data([some], latest, 0)
         found += payload(message).metrics
     assert [metric.HasField("datatype") for metric in found] == [True, *[always_typed] * 3]
     assert {metric.datatype for metric in found} <= {0, 6}
@@ -330,7 +330,7 @@ def test_a_birth_has_type_and_value_of_each_metric(
     area: Any, type: str, number: int, field: str, value: Any
 ) -> None:
     tag = Tag("speed", area, 0, type)
-    made = EdgeNode(Names("group", "edge"))
+    made = EdgeNode(Names("group", "edge"), int)
     made.begin()
     made.adopt({"pump": [tag]}, {})
     *_, birth = made.births({"pump": True}, lambda: latest(reading(value, 1.0, tag)))
@@ -344,11 +344,11 @@ def test_messages_have_the_time_now_and_metrics_the_time_of_their_reading(
 ) -> None:
     monkeypatch.setattr(time, "time", lambda: 1_700_000_000.25)
     now = 1_700_000_000_250
-    made = EdgeNode(Names("group", "edge"))
+    made = EdgeNode(Names("group", "edge"), int)
     made.begin()
     made.adopt({"pump": [SPEED, LEVEL]}, {})
     births = list(made.births({"pump": True}, lambda: latest(reading(5, 10.5))))
-    data = list(made.data([reading(3, 8.25), reading(6, 11.75)], latest))
+    data = list(made.data([reading(3, 8.25), reading(6, 11.75)], latest, 0))
     messages = [*births, *data, *made.device_deaths({"pump": False}), made.death()]
 
     times = [
@@ -368,11 +368,11 @@ def test_messages_have_the_time_now_and_metrics_the_time_of_their_reading(
 
 
 def test_all_messages_but_the_death_of_the_node_are_numbered_from_its_birth() -> None:
-    made = EdgeNode(Names("group", "edge"))
+    made = EdgeNode(Names("group", "edge"), int)
     made.begin()
     made.adopt({"pump": [SPEED], "fan": [SPEED]}, {})
     births = made.births({"pump": True, "fan": True}, latest)
-    data = list(made.data([reading(3, 8.0)], latest))
+    data = list(made.data([reading(3, 8.0)], latest, 0))
     deaths = made.device_deaths({"pump": False, "fan": True})
 
     assert [payload(each).seq for each in [*births, *data, *deaths]] == [0, 1, 2, 3, 4]
@@ -385,13 +385,13 @@ def test_sequence_numbers_begin_again_after_255() -> None:
     found = [
         payload(message).seq
         for time in range(300)
-        for message in made.data([reading(time, 2.0 + time)], latest)
+        for message in made.data([reading(time, 2.0 + time)], latest, 0)
     ]
     assert found == [number % 256 for number in range(2, 302)]
 
 
 def test_session_numbers_begin_again_after_255() -> None:
-    made = EdgeNode(Names("group", "edge"))
+    made = EdgeNode(Names("group", "edge"), int)
     found = []
     for _ in range(258):
         made.begin()
@@ -400,9 +400,9 @@ def test_session_numbers_begin_again_after_255() -> None:
 
 
 def test_what_a_birth_has_is_not_repeated_and_what_is_older_is_historical() -> None:
-    made = node(reading(5, 10.0), reading(7, 10.0, LEVEL))
+    made = node(reading(5, 10.0), reading(7, 10.0, LEVEL), waiting=2)
     some = [reading(3, 8.0), reading(5, 10.0), reading(6, 11.0), reading(8, 11.0, LEVEL)]
-    messages = list(made.data(some, latest))
+    messages = list(made.data(some, latest, 0))
     found = [
         [(metric.int_value, metric.is_historical) for metric in payload(message).metrics]
         for message in messages
@@ -413,41 +413,53 @@ def test_what_a_birth_has_is_not_repeated_and_what_is_older_is_historical() -> N
 @pytest.mark.parametrize("of", [None, Tag("speed", "input_registers", 0, "string:2")])
 def test_after_a_birth_without_value_a_poll_from_before_it_is_current(of: Tag | None) -> None:
     now = time.time()
-    made = EdgeNode(Names("group", "edge"))
+    made = EdgeNode(Names("group", "edge"), int)
     made.begin()
     made.adopt({"pump": [SPEED]}, {"pump": now - 2})
     known = () if of is None else (reading("on", now, of),)
     *_, birth = made.births({"pump": True}, lambda: latest(*known))
     [metric] = payload(birth).metrics
     assert (metric.is_null, metric.timestamp >= int(now * 1000)) == (True, True)
-    messages = list(made.data([reading(5, now - 3), reading(6, now - 1)], latest))
+    messages = list(made.data([reading(5, now - 3), reading(6, now - 1)], latest, 0))
     found = [payload(message).metrics[0] for message in messages]
     # The first one waited since before a restart or a reload.
     assert [(metric.int_value, metric.is_historical) for metric in found] == [(5, True), (6, False)]
 
 
+def test_what_waited_is_historical_whatever_its_time() -> None:
+    made = node(reading(5, 10.0), waiting=13)
+    some = [reading(3, 20.0), reading(4, 9.0), reading(5, 10.0), reading(6, 11.0)]
+    messages = list(made.data(some, latest, 10))
+    found = [payload(message).metrics[0] for message in messages]
+    assert [(each.int_value, each.is_historical) for each in found] == [
+        (3, True),
+        (4, True),
+        (6, False),
+    ]
+
+
 def test_no_value_is_historical_after_the_clock_was_set_back() -> None:
     made = node(reading(5, time.time() + 3600), reading(7, 10.0, LEVEL))
-    [message] = made.data([reading(6, time.time())], latest)
+    [message] = made.data([reading(6, time.time())], latest, 0)
     assert [metric.is_historical for metric in payload(message).metrics] == [False]
 
 
 def test_a_device_without_birth_is_born_for_its_values_and_dies_after_them() -> None:
-    made = EdgeNode(Names("group", "edge"))
+    made = EdgeNode(Names("group", "edge"), int)
     made.begin()
     made.adopt({"pump": [SPEED]}, {})
     assert kinds(made.births({"pump": False}, latest)) == ["NBIRTH"]
     silent = reading(None, 10.0, fault=FAULTS["timeout"])
-    assert kinds(made.data([silent], latest)) == []
+    assert kinds(made.data([silent], latest, 0)) == []
     old = [reading(3, 8.0), silent]
-    assert kinds(made.data(old, lambda: latest(silent))) == ["DBIRTH", "DDATA"]
+    assert kinds(made.data(old, lambda: latest(silent), 0)) == ["DBIRTH", "DDATA"]
     assert kinds(made.device_deaths({"pump": False}, old)) == []
     assert kinds(made.device_deaths({"pump": False}, [silent])) == ["DDEATH"]
 
 
 def test_an_exception_is_no_silence() -> None:
     made = node(reading(5, 10.0))
-    [message] = made.data([reading(None, 11.0, fault=2)], latest)
+    [message] = made.data([reading(None, 11.0, fault=2)], latest, 0)
     [metric] = payload(message).metrics
     assert metric.is_null
     assert metric.properties.values[0].int_value == 0
@@ -456,7 +468,9 @@ def test_an_exception_is_no_silence() -> None:
 def test_a_tag_that_is_no_more_has_no_data() -> None:
     made = node(reading(5, 10.0))
     gone = Tag("gone", "input_registers", 5)
-    assert kinds(made.data([reading(5, 11.0, gone), reading(5, 11.0, device="fan")], latest)) == []
+    assert (
+        kinds(made.data([reading(5, 11.0, gone), reading(5, 11.0, device="fan")], latest, 0)) == []
+    )
 
 
 FLOW = Tag("flow", "input_registers", 2, "uint16[2]", null=frozenset({65535}))
@@ -478,25 +492,25 @@ FLOW = Tag("flow", "input_registers", 2, "uint16[2]", null=frozenset({65535}))
     ],
 )
 def test_a_value_from_before_a_change_of_its_tag_is_left_out(value: Any, of: Tag) -> None:
-    made = EdgeNode(Names("group", "edge"))
+    made = EdgeNode(Names("group", "edge"), int)
     made.begin()
     made.adopt({"pump": [SPEED, LEVEL, FLOW]}, {})
     list(made.births({"pump": True}, lambda: latest(reading(5, 10.0))))
     old = reading(value, 10.5, of)
     some = [reading(6, 11.0), reading(8, 11.0, LEVEL), old, reading(9, 12.0, LEVEL)]
-    messages = list(made.data(some, latest))
+    messages = list(made.data(some, latest, 0))
     found = [[metric.int_value for metric in payload(message).metrics] for message in messages]
     assert found == [[6, 8], [9]]
     assert made.unfit == [old]
-    assert list(made.data([old], latest)) == []
+    assert list(made.data([old], latest, 0)) == []
     assert made.unfit == [old]
     # No value fits any type.
-    assert kinds(made.data([reading(None, 13.0, of, fault=2)], latest)) == ["DDATA"]
+    assert kinds(made.data([reading(None, 13.0, of, fault=2)], latest, 0)) == ["DDATA"]
     assert made.unfit == []
 
 
 def test_a_birth_has_no_value_from_before_a_change_of_its_tag() -> None:
-    made = EdgeNode(Names("group", "edge"))
+    made = EdgeNode(Names("group", "edge"), int)
     made.begin()
     made.adopt({"pump": [SPEED]}, {})
     old = reading("on", 10.0, Tag("speed", "input_registers", 0, "string:2"))
@@ -540,6 +554,7 @@ def test_an_output_refuses_what_is_left_out_and_publishes_the_rest(
     published: list[Message] = []
     settings = {"type": "sparkplug", "url": "mqtt://h", "group": "g", "edge_node": "e"}
     output = SparkplugOutput("scada", SparkplugConfig.model_validate(settings), Pump())
+    output.use_buffer(Buffer())
     monkeypatch.setattr(output, "_ready", lambda: output._node.adopt({"pump": [SPEED]}, {}))
     monkeypatch.setattr(output, "_publish", lambda _, messages: published.extend(messages))
     with pytest.raises(Refused, match="before their tags were changed") as refused:

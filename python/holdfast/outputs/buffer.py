@@ -54,6 +54,8 @@ class Buffer:
         self.dropped: int = 0 if before is None else before.dropped
         """Readings that were lost because there was no room."""
         self._dropped_before = self.dropped
+        self._done = 0
+        """Readings of batches that are done."""
 
     def offer(self, polls: Iterable[Sequence[Reading]]) -> None:
         """Adds the readings of polls. If there is no room, the oldest are dropped and counted."""
@@ -111,6 +113,16 @@ class Buffer:
         waiting += 0 if stored is None else stored.count
         return waiting + (0 if before is None else len(before))
 
+    @property
+    def first_number(self) -> int:
+        """The number of the oldest reading, in the order of all that were ever in the buffer."""
+        return self._done + self.dropped
+
+    @property
+    def next_number(self) -> int:
+        """The number of the next reading that is offered."""
+        return self.first_number + len(self)
+
     def take(self, max_readings: int, timeout: float) -> list[Reading]:
         """Returns the oldest readings. Waits for the first up to `timeout` seconds.
 
@@ -158,6 +170,7 @@ class Buffer:
 
         Raises `OSError` if the file fails. Even then, `take` does not return them again.
         """
+        self._done += len(self._batch)
         was_stored, self._batch, self._is_batch_stored = self._is_batch_stored, [], False
         if was_stored:
             assert self.stored is not None, "the batch is in it"

@@ -59,6 +59,10 @@ class Receiver(Protocol):
         """Takes the stop of the output, which ends waits early. Called before all else."""
         return
 
+    def use_buffer(self, _buffer: Buffer, /) -> None:
+        """Takes the buffer, whose order tells what waited. Called before all else."""
+        return
+
     def send(self, readings: list[Reading]) -> None:
         """Sends readings, and returns when the receiver has confirmed them.
 
@@ -165,6 +169,7 @@ class OutputSender:
     def _run(self, stop: Stop) -> None:
         stop.then(self._buffer.wake)
         self._receiver.use_stop(stop)
+        self._receiver.use_buffer(self._buffer)
         try:
             while not stop.is_set():
                 self._use_file()

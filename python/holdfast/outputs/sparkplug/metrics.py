@@ -52,11 +52,23 @@ class DeviceMetrics:
         self._births: dict[str, float] = {}
         """When the tags had their values of the last birth. Without a value: when the device got
         its tags, because a poll that was answered before a birth may come after it."""
+        self._next_number = 0
+        """The readings before this number waited at the last birth, and were not newer than it."""
         self._bad: set[str] = set()
 
-    def birth(self, payload: Any, latest: Mapping[str, Reading], aliases: Iterator[int]) -> None:
-        """Adds all metrics with their current values, and with new aliases."""
+    def birth(
+        self,
+        payload: Any,
+        latest: Mapping[str, Reading],
+        aliases: Iterator[int],
+        next_number: int,
+    ) -> None:
+        """Adds all metrics with their current values, and with new aliases.
+
+        `next_number` is from before `latest`: what came between the two is sent once more.
+        """
         self._bad.clear()
+        self._next_number = next_number
         tags = self._tags.values()
         self._entries = {tag.name: _entries(self.device, tag, aliases) for tag in tags}
         every = [entry for entries in self._entries.values() for entry in entries]
@@ -82,12 +94,14 @@ class DeviceMetrics:
                 if entry.tag.unit:
                     _property(metric, "engUnit", STRING, entry.tag.unit)
 
-    def is_known(self, reading: Reading) -> bool:
+    def is_known(self, reading: Reading, number: int) -> bool:
         """Whether the birth had this reading, or there is no metric for it any more."""
         name = reading.tag.name
-        return name not in self._entries or self._births.get(name) == reading.time
+        if name not in self._entries:
+            return True
+        return number < self._next_number and self._births[name] == reading.time
 
-    def add(self, payload: Any, reading: Reading) -> bool:
+    def add(self, payload: Any, reading: Reading, number: int) -> bool:
         """Adds the metrics of a reading.
 
         Returns whether the reading fits: it may have waited since before the tag was changed.
@@ -96,9 +110,12 @@ class DeviceMetrics:
         if not self._is_of_same_meaning(reading):
             return False
         # A host stores what is historical, and does not show it as current: after an outage, the
-        # birth has the newest values, and those that waited follow. A birth that is in the future
-        # was before the clock was set back: nobody knows then.
-        is_historical = reading.time < self._births[name] <= time.time()
+        # birth has the newest values, and those that waited follow. Their order tells, because the
+        # clock may have been set. Older values that come later are those of a file that could not
+        # be opened at first; if the birth is in the future, the clock was set back since.
+        is_historical = number < self._next_number or (
+            reading.time < self._births[name] <= time.time()
+        )
         entries, first = self._entries[name], len(payload.metrics)
         try:
             have_values = [_fill(payload.metrics.add(), entry, reading.value) for entry in entries]

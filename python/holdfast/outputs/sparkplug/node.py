@@ -62,11 +62,14 @@ def state_topic(host: str) -> str:
 class EdgeNode:
     """What a host knows of this node and its devices. For one thread.
 
-    Metrics have their types in births, and if `always_typed`, also in data.
+    Metrics have their types in births, and if `always_typed`, also in data. `next_number` is the
+    number of the next reading that will wait for `data`: those before it are older than a birth.
     """
 
-    def __init__(self, names: Names, *, always_typed: bool = False) -> None:
-        self._names = names
+    def __init__(
+        self, names: Names, next_number: Callable[[], int], *, always_typed: bool = False
+    ) -> None:
+        self._names, self._next_number = names, next_number
         self._always_typed = always_typed
         self._seq = 0
         self._session = -1
@@ -134,8 +137,8 @@ class EdgeNode:
         ]
         if not new:
             return []
-        known = latest()
-        return [self._dbirth(device, known.get(device, {})) for device in new]
+        number, known = self._next_number(), latest()
+        return [self._dbirth(device, known.get(device, {}), number) for device in new]
 
     def device_deaths(
         self, answering: Mapping[str, bool], readings: Iterable[Reading] = ()
@@ -151,24 +154,29 @@ class EdgeNode:
         self,
         readings: Iterable[Reading],
         latest: Latest,
+        first_number: int,
     ) -> Iterator[Message]:
-        """DDATA of readings. A device that does not answer is born for values that had to wait."""
+        """DDATA of readings. A device that does not answer is born for values that had to wait.
+
+        `first_number` is the number of the first reading.
+        """
         self.unfit = []
         open_payloads: dict[str, tuple[Any, set[str]]] = {}
-        for reading in readings:
+        for number, reading in enumerate(readings, first_number):
             device = self._devices.get(reading.device)
             if device is None or _is_silent(reading):
                 continue
             if device.device not in self._alive:
-                yield self._dbirth(device.device, latest().get(device.device, {}))
-            if device.is_known(reading):
+                next_number, known = self._next_number(), latest()
+                yield self._dbirth(device.device, known.get(device.device, {}), next_number)
+            if device.is_known(reading, number):
                 continue
             payload, names = open_payloads.get(device.device) or (Payload(), set())
             if reading.tag.name in names:
                 yield self._ddata(device.device, payload)
                 payload, names = Payload(), set()
             open_payloads[device.device] = payload, names
-            if device.add(payload, reading):
+            if device.add(payload, reading, number):
                 names.add(reading.tag.name)
             else:
                 self.unfit.append(reading)
@@ -176,10 +184,10 @@ class EdgeNode:
             if payload.metrics:
                 yield self._ddata(name, payload)
 
-    def _dbirth(self, device: str, latest: Mapping[str, Reading]) -> Message:
+    def _dbirth(self, device: str, latest: Mapping[str, Reading], number: int) -> Message:
         self._alive.add(device)
         payload = Payload(timestamp=_now(), seq=self._next())
-        self._devices[device].birth(payload, latest, self._aliases)
+        self._devices[device].birth(payload, latest, self._aliases, number)
         return self._message("DBIRTH", device, payload)
 
     def _ddata(self, device: str, payload: Any) -> Message:

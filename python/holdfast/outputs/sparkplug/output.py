@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from holdfast.config.models.outputs import SparkplugConfig
     from holdfast.net.mqtt.packets import Publish
+    from holdfast.outputs.buffer import Buffer
     from holdfast.outputs.device_access import Site
     from holdfast.outputs.mqtt.delivery import Message
     from holdfast.polling import Reading
@@ -30,11 +31,18 @@ class SparkplugOutput(BrokerReceiver):
         super().__init__(name, settings, f"{settings.group}/{settings.edge_node}")
         self._settings, self._site = settings, site
         self._names = Names(settings.group, settings.edge_node)
-        self._node = EdgeNode(self._names, always_typed=settings.datatypes == "always")
+        self._node = EdgeNode(
+            self._names, self._next_number, always_typed=settings.datatypes == "always"
+        )
         self._commands = Commands(name, self._broker, site, self._node.find, writes=settings.writes)
         self._primary = None if settings.primary_host is None else PrimaryHost()
         self._has_published_births = False
         self._births = 0
+        self._buffer: Buffer | None = None
+
+    def use_buffer(self, buffer: Buffer) -> None:
+        """Takes the buffer, whose order tells which values are historical."""
+        self._buffer = buffer
 
     def send(self, readings: list[Reading]) -> None:
         """Publishes readings, and waits until the broker must have them.
@@ -42,8 +50,10 @@ class SparkplugOutput(BrokerReceiver):
         If it fails, the same readings follow in the next session, as historical values. Raises
         `Refused` for those that are of an earlier form of their tag.
         """
+        assert self._buffer is not None, "use_buffer comes first"
+        number = self._buffer.first_number
         session = self._ready()
-        data = list(self._node.data(readings, self._latest))
+        data = list(self._node.data(readings, self._latest, number))
         deaths = self._node.device_deaths(self._site.answering(), readings)
         self._publish(session, [*data, *deaths])
         if unfit := self._node.unfit:
@@ -128,6 +138,10 @@ class SparkplugOutput(BrokerReceiver):
             devices = [device for device, some in tags.items() if any(tag.writable for tag in some)]
             topics = [self._names.of("DCMD", device) for device in devices]
             session.subscribe(topics, retained=False)
+
+    def _next_number(self) -> int:
+        assert self._buffer is not None, "use_buffer comes first"
+        return self._buffer.next_number
 
     def _latest(self) -> dict[str, dict[str, Reading]]:
         """The last reading of each tag of each device."""
