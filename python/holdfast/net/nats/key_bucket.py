@@ -62,7 +62,8 @@ def first_revision(last_revision: int) -> int:
     """Where the revisions of a new bucket begin: after those of a lost one of the same name.
 
     Who compares them, such as a consumer of values, may know only the lost one. No bucket has a
-    million changes a second, so the time in microseconds is later, if the clock is right.
+    million changes a second, so the time in microseconds is later, if the clock is right now and
+    was when the lost one was made.
     """
     return max(last_revision + 1, time.time_ns() // 1000)
 
