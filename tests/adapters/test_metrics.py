@@ -6,6 +6,7 @@ import contextlib
 import gzip
 import sys
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -493,6 +494,13 @@ def test_plain_text_otherwise_and_compressed_when_asked_for(client: web.Client) 
     assert (
         samples(gzip.decompress(packed.body).decode()).keys() == samples(plain.body.decode()).keys()
     )
+
+
+def test_a_time_that_gzip_has_no_room_for(
+    client: web.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time, "time", lambda: 2.0**32)
+    assert client.ask("GET", "/metrics", headers={"Accept-Encoding": "gzip"}).status == 200
 
 
 def test_head_and_other_methods(client: web.Client) -> None:

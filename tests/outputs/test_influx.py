@@ -7,6 +7,7 @@ import gzip
 import http.client
 import socket
 import threading
+import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 
@@ -110,6 +111,16 @@ def test_points_arrive_over_one_connection(database: Database, compressed: bool)
     [path, *others] = [path for path, _ in database.requests]
     assert path == "/api/v2/write?org=my+org&bucket=b%2F1&precision=ns"
     assert others == [path] * 2
+
+
+def test_a_time_that_gzip_has_no_room_for(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    output = influx(database.url, bucket="b", gzip=True)
+    monkeypatch.setattr(time, "time", lambda: 2.0**32)
+    output.send(numbered(1))
+    output.close()
+    assert len(database.points) == 1
 
 
 def test_another_receiver_has_its_own_path(database: Database, tmp_path: Path) -> None:

@@ -143,7 +143,8 @@ class Influx(Receiver):
         """Sends a request. A connection that was closed while it was idle is opened again."""
         headers = {"Content-Type": "text/plain; charset=utf-8", **self._authorization()}
         if self._settings.gzip:
-            body, headers["Content-Encoding"] = gzip.compress(body, 1), "gzip"
+            # A time beyond 2106 has no room in the header.
+            body, headers["Content-Encoding"] = gzip.compress(body, 1, mtime=0), "gzip"
         is_fresh = self._connection is None
         try:
             return self._request(body, headers)

@@ -138,7 +138,8 @@ class App(Application):
         registry = self._registry if names is None else self._registry.restricted_registry(names)
         answer = response(kind.encode(), encode(cast("CollectorRegistry", registry)))
         if gzip_accepted(accepted(b"accept-encoding")):
-            answer.body = gzip.compress(answer.body)
+            # A time beyond 2106 has no room in the header.
+            answer.body = gzip.compress(answer.body, mtime=0)
             answer.headers = (*answer.headers, (b"content-encoding", b"gzip"))
         return answer
 
