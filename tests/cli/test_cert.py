@@ -19,6 +19,7 @@ from cryptography import x509
 import holdfast
 from holdfast.appliance import Appliance
 from holdfast.config import load
+from holdfast.net.certificates import authority
 from holdfast.net.certificates.authority import KEY_KINDS
 from holdfast.net.certificates.inspection import serial_text
 from support import wire
@@ -290,6 +291,38 @@ def test_bytes_that_are_not_text_are_refused(tmp_path: Path) -> None:
     told = pki.refuses("client", "panel", "--role", "a\udc9b")
     assert told.endswith("role that is not text in UTF-8: 'a\\udc9b'")
     assert not (pki / "panel.key").exists()
+
+
+def test_nothing_begins_before_1970(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = datetime(1970, 1, 1, tzinfo=UTC)
+    monkeypatch.setattr(authority, "now", lambda: first + timedelta(seconds=20))
+    pki = Pki(tmp_path)
+    pki.does("ca", "plant")
+    pki.does("client", "panel")
+    pki.does("crl")
+    assert pki.certificate("ca.pem").not_valid_before_utc == first
+    assert pki.certificate("panel.pem").not_valid_before_utc == first
+    made = x509.load_pem_x509_crl((pki / "crl.pem").read_bytes())
+    assert made.last_update_utc == first
+
+
+def test_nothing_is_made_before_the_authority_is_valid(
+    plant: Pki, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began = plant.certificate("ca.pem").not_valid_before_utc
+    monkeypatch.setattr(authority, "now", lambda: datetime(2001, 2, 3, 4, 5, 6, tzinfo=UTC))
+    for command in (
+        ["server", "other", "--san=other"],
+        ["client", "other"],
+        ["revoke", str(plant / "panel.pem")],
+        ["crl"],
+    ):
+        assert plant.refuses(*command) == (
+            f"holdfast: the authority is not valid before {began:%Y-%m-%d %H:%M} UTC, and the "
+            "clock says 2001-02-03 04:05 UTC: correct it"
+        )
+    assert not (plant / "other.key").exists()
+    assert not (plant / "crl.pem").exists()
 
 
 def test_names_in_certificates_can_not_forge_lines(tmp_path: Path) -> None:

@@ -486,6 +486,13 @@ mod tests {
             ),
             "CERT: certificate 1 can't be read, allowed: X.509 version 3"
         );
+        let ancient = Owner::new("plc", None, |params| {
+            params.not_before = rcgen::date_time_ymd(1969, 12, 31);
+        });
+        assert_eq!(
+            outcome(&ancient.pem(), ancient.key.serialize_pem().as_bytes()),
+            "CERT: certificate 1 can't be read"
+        );
         let missing = Path::new("/nonexistent/ca.pem");
         let settings =
             ClientSettings { ca: Some(missing), own: None, decrypted_key: None, name: "plc" };

@@ -33,7 +33,9 @@ pub(super) fn own(
         return Err(FileError::content(cert_file, "found no certificate"));
     };
     check_order(&chain).map_err(|flaw| FileError::content(cert_file, flaw))?;
-    let key = signing_key(key, end_entity)
+    let parsed = Parsed::new(end_entity)
+        .map_err(|_| FileError::content(cert_file, "certificate 1 can't be read"))?;
+    let key = signing_key(key, &parsed)
         .ok_or_else(|| wrong(format!("found a key of another kind, allowed: {KEYS}")))?;
     let own = CertifiedKey::new(chain, key);
     match own.keys_match() {
@@ -65,12 +67,9 @@ fn check_order(chain: &[CertificateDer<'_>]) -> Result<(), String> {
 }
 
 /// `None` for an unsupported kind of key.
-fn signing_key(
-    key: PrivateKeyDer<'static>,
-    of: &CertificateDer<'_>,
-) -> Option<Arc<dyn SigningKey>> {
+fn signing_key(key: PrivateKeyDer<'static>, of: &Parsed) -> Option<Arc<dyn SigningKey>> {
     // The certificate says whether an RSA key is for RSASSA-PSS alone.
-    match Parsed::new(of).ok()?.pss_algorithm() {
+    match of.pss_algorithm() {
         Some(algorithm) => Some(Arc::new(PssKey::new(&key, &algorithm)?)),
         None => provider().key_provider.load_private_key(key).ok(),
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
@@ -28,7 +28,6 @@ from holdfast.protocol import MAX_ROLE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from datetime import datetime
 
     from holdfast.net.certificates.parser import PrivateKey
     from holdfast.net.certificates.pem import File
@@ -158,11 +157,11 @@ class Authority:
     ) -> x509.CertificateRevocationList:
         """Returns a new list: the entries of the one before, and these serial numbers.
 
-        Raises `Refused` if the list before is that of another authority.
+        Raises `Refused` if the list before is that of another authority, or the clock is wrong.
         """
-        time, number = now(), 1
+        time, number = self._now(), 1
         builder = x509.CertificateRevocationListBuilder().issuer_name(self.certificate.subject)
-        builder = builder.last_update(time - CLOCK_SKEW).next_update(time + timedelta(days=days))
+        builder = builder.last_update(_begin(time)).next_update(time + timedelta(days=days))
         known: set[int] = set()
         if before is not None:
             if not is_list_of(before, self.certificate):
@@ -182,13 +181,27 @@ class Authority:
             .sign(self.key, _hash(self.key))
         )
 
+    def _now(self) -> datetime:
+        """The time. Raises `Refused` if the clock is before the beginning of the authority.
+
+        What is made by such a clock has expired when it is right.
+        """
+        time, first = now(), self.certificate.not_valid_before_utc
+        if time < first:
+            raise Refused(
+                f"the authority is not valid before {first:%Y-%m-%d %H:%M} UTC, and the clock says "
+                f"{time:%Y-%m-%d %H:%M} UTC: correct it"
+            )
+        return time
+
     def _leaf(
         self, name: str, subject_key: PrivateKey, days: int, purpose: x509.ObjectIdentifier
     ) -> x509.CertificateBuilder:
-        ends, last = now() + timedelta(days=days), self.certificate.not_valid_after_utc
-        if last <= now():
+        time, last = self._now(), self.certificate.not_valid_after_utc
+        if last <= time:
             raise Refused(f"the authority expired on {last:%Y-%m-%d}: create a new one")
-        builder = _builder(_subject(name), self.certificate.subject, subject_key, min(ends, last))
+        ends = min(time + timedelta(days=days), last)
+        builder = _builder(_subject(name), self.certificate.subject, subject_key, ends)
         return (
             builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
             .add_extension(_leaf_usage(subject_key), critical=True)
@@ -279,12 +292,17 @@ def _builder(
         .issuer_name(issuer)
         .public_key(subject_key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now() - CLOCK_SKEW)
+        .not_valid_before(_begin(now()))
         .not_valid_after(ends)
         .add_extension(
             x509.SubjectKeyIdentifier.from_public_key(subject_key.public_key()), critical=False
         )
     )
+
+
+def _begin(time: datetime) -> datetime:
+    """When something begins that is made now: not before 1970, which many programs can't read."""
+    return max(time - CLOCK_SKEW, datetime(1970, 1, 1, tzinfo=UTC))
 
 
 def _leaf_usage(subject_key: PrivateKey) -> x509.KeyUsage:
