@@ -597,16 +597,17 @@ def test_a_backlog_is_handled_in_turns_and_losses_are_counted(
     assert found.dropped == 7
 
 
-def test_the_age_of_a_value_does_not_follow_the_clock(
+def test_the_age_of_a_value_counts_a_suspend_and_does_not_follow_the_clock(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clocks = SimpleNamespace(time=lambda: 1_700_000_002.0, monotonic=lambda: 50.0)
+    clocks = SimpleNamespace(time=lambda: 1_700_000_002.0, monotonic=lambda: 7.0, now=lambda: 50.0)
     monkeypatch.setattr(tag_values, "time", clocks)
+    monkeypatch.setattr(tag_values, "standstill", clocks)
     found = TagValues(cast("Any", Polls()))
     name = adopt(found, load(saved(tmp_path, settings(502))))["m"]
     blocks: list[Any] = [("holding_registers", 0, 6, bytes(12), 0, 1_700_000_000.0)]
     found._handle(deque([(name, 0.0, blocks)]))
-    clocks.time, clocks.monotonic = lambda: 1_700_003_602.0, lambda: 55.0
+    clocks.time, clocks.now = lambda: 1_700_003_602.0, lambda: 55.0
     _, ages = tag_metrics(cast("Any", SimpleNamespace(tag_values=found.latest_with_ages)))
     assert {sample.value for sample in ages.samples} == {7.0}
 

@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-/// The zero of the clock of a connection.
+/// A moment, such as the zero of the clock of a connection.
 #[derive(Debug, Clone, Copy)]
 pub struct Epoch(Duration);
 

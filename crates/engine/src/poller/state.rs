@@ -2,9 +2,9 @@
 
 use std::sync::atomic::{AtomicBool, AtomicU16, AtomicU32, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use holdfast_runtime::{Counter, lock};
+use holdfast_runtime::{Counter, Epoch, lock};
 
 use super::health::Health;
 use super::status::Status;
@@ -38,9 +38,9 @@ pub struct DeviceState {
 
 #[derive(Debug, Default)]
 struct Times {
-    last_good: Option<Instant>,
+    last_good: Option<Epoch>,
     /// Since when the last poll has failed, or nothing is known.
-    error_since: Option<Instant>,
+    error_since: Option<Epoch>,
 }
 
 counters! {
@@ -144,7 +144,7 @@ impl DeviceState {
     pub(super) fn set_standby(&self, standby: bool) {
         if !standby {
             self.health.store(Health::Unknown.code(), Ordering::Relaxed);
-            self.times().error_since = Some(Instant::now());
+            self.times().error_since = Some(Epoch::now());
         }
         self.standby.store(standby, Ordering::Relaxed);
     }
@@ -189,7 +189,7 @@ impl DeviceState {
     /// Records that polling begins. A device that was in error before still is.
     pub(super) fn begun(&self) {
         if Health::from_code(self.health.load(Ordering::Relaxed)) == Health::Unknown {
-            self.times().error_since.get_or_insert_with(Instant::now);
+            self.times().error_since.get_or_insert_with(Epoch::now);
         }
     }
 
@@ -197,7 +197,7 @@ impl DeviceState {
     pub(super) fn answered(&self, round_trip: Duration) {
         self.counters.valid.add();
         self.round_trip.store(round_trip.as_micros() as u64, Ordering::Relaxed);
-        self.times().last_good = Some(Instant::now());
+        self.times().last_good = Some(Epoch::now());
     }
 
     /// Records a complete poll.
@@ -209,7 +209,7 @@ impl DeviceState {
     }
 
     pub(super) fn bad(&self, fault: Fault) {
-        self.times().error_since.get_or_insert_with(Instant::now);
+        self.times().error_since.get_or_insert_with(Epoch::now);
         self.health.store(Health::Error.code(), Ordering::Relaxed);
         self.last_error.store(fault.code(), Ordering::Relaxed);
         let failures = self.failures.fetch_add(1, Ordering::Relaxed) + 1;

@@ -25,6 +25,7 @@ from holdfast.outputs.device_access import DeviceInfo
 from holdfast.outputs.line_protocol import has_field
 from holdfast.polling import Reading
 from holdfast.polling.readings import Reader
+from holdfast.runtime import standstill
 from holdfast.runtime.heartbeat import Heartbeat
 
 if TYPE_CHECKING:
@@ -153,7 +154,7 @@ class TagValues:
         """By the name in polls."""
         self._outputs: dict[str, _Output] = {}
         self._latest: dict[str, tuple[DevicePoll, float]] = {}
-        """The last poll of each device, and by how much the clock was ahead of `time.monotonic`
+        """The last poll of each device, and by how much the clock was ahead of `standstill.now`
         when it came."""
         self._answering: dict[str, bool] = {}
         self.standby: frozenset[str] = frozenset()
@@ -297,9 +298,11 @@ class TagValues:
             return [reading for poll, _ in self._latest.values() for reading in poll.readings]
 
     def latest_with_ages(self) -> list[tuple[Reading, float]]:
-        """The same, each with its age in seconds, also after the clock was set. Thread-safe."""
+        """The same, each with its age in seconds, also after the clock was set, or a suspend.
+        Thread-safe.
+        """
         with self._lock:
-            now = time.monotonic()
+            now = standstill.now()
             return [
                 (reading, max(0.0, now + ahead - reading.time))
                 for poll, ahead in self._latest.values()
@@ -381,7 +384,7 @@ class TagValues:
                 return
 
     def _offer(self, polls: Sequence[DevicePoll]) -> None:
-        ahead = time.time() - time.monotonic()
+        ahead = time.time() - standstill.now()
         for poll in polls:
             self._latest[poll.device] = poll, ahead
             if poll.is_standby is not (poll.device in self.standby):
