@@ -352,7 +352,8 @@ class TagValues:
             self._heartbeat.beat()
             if not taken[0]:
                 continue
-            self._stopping.wait(_GATHER_S)
+            # Not a wait for the stop: on some Pythons, that follows a clock which may be set back.
+            time.sleep(_GATHER_S)
             found = deque(taken[0])
             more = self.results.take(0.0)
             if more is not None:
@@ -372,7 +373,7 @@ class TagValues:
             except Exception:  # A fault in one poll must not end all outputs.
                 log_lines.problem("tag_values_failed")
             if found:
-                self._stopping.wait(_TURN_S if _is_late(found[0]) else _YIELD_S)
+                time.sleep(_TURN_S if _is_late(found[0]) else _YIELD_S)
 
     def _turn(self, found: deque[Poll], until: float) -> Iterator[DevicePoll]:
         """Takes and converts polls until a time, at least one."""

@@ -262,7 +262,8 @@ class Polling:
             if self._stopping.is_set():
                 return
             self._loop.call_soon_threadsafe(self._hand_over, *taken)
-            self._stopping.wait(MIN_BATCH_INTERVAL_S)
+            # Not a wait for the stop: on some Pythons, that follows a clock which may be set back.
+            time.sleep(MIN_BATCH_INTERVAL_S)
 
     def _hand_over(self, polls: Sequence[Poll], writes: Sequence[tuple[int, int]]) -> None:
         for number, fault in writes:
