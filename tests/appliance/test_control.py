@@ -100,6 +100,48 @@ def test_a_path_need_not_be_utf_8() -> None:
         running.close()
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="has paths in Unicode")
+@pytest.mark.usefixtures("runtime")
+def test_a_start_with_another_locale_notices_it() -> None:
+    running = Control(Path("Kühlung.yaml"), {})
+    try:
+        # The same bytes, as Python has them with the locale C.
+        assert control.is_running(Path("K\udcc3\udcbchlung.yaml"))
+    finally:
+        running.close()
+
+
+@pytest.mark.usefixtures("runtime")
+def test_one_that_does_not_answer_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    def ask(*_: object) -> None:
+        raise control.NotRunning("the appliance has not answered")
+
+    monkeypatch.setattr(control, "ask", ask)
+    running = Control(FILE, {})
+    try:
+        assert control.is_running(FILE)
+    finally:
+        running.close()
+    assert not control.is_running(FILE)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes have no folders")
+def test_it_is_found_on_a_full_disk(runtime: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gettempdir() -> str:
+        raise FileNotFoundError("No usable temporary directory found")
+
+    monkeypatch.setattr(control, "RUN", runtime / "run")
+    monkeypatch.setenv("TMPDIR", str(runtime))
+    monkeypatch.delenv("RUNTIME_DIRECTORY")
+    running = Control(FILE, {})
+    try:
+        monkeypatch.setattr(tempfile, "gettempdir", gettempdir)
+        assert pinged(FILE)
+        assert control.is_running(FILE)
+    finally:
+        running.close()
+
+
 @pytest.mark.usefixtures("runtime")
 def test_it_answers_although_no_thread_can_start(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(control, "TIMEOUT_S", 3600.0)
@@ -204,7 +246,7 @@ def test_root_finds_appliances_of_others_in_folders_that_only_they_can_make(
     made = runtime / folder.format(user=user, other=user + 1)
     made.mkdir(parents=True)
     monkeypatch.setattr(control, "RUN", runtime / "run")
-    monkeypatch.setattr(tempfile, "tempdir", str(runtime / "tmp"))
+    monkeypatch.setenv("TMPDIR", str(runtime / "tmp"))
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(made))
     running = Control(FILE, {})
     monkeypatch.delenv("RUNTIME_DIRECTORY")

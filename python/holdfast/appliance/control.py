@@ -12,7 +12,6 @@ import json
 import os
 import socket
 import sys
-import tempfile
 import threading
 from multiprocessing.connection import Client, Listener
 from pathlib import Path
@@ -58,7 +57,10 @@ class Control:
     """Answers requests until `close`. Raises `OSError` if the socket can't be created."""
 
     def __init__(self, file: Path, handlers: Mapping[str, Handler]) -> None:
-        self._handlers: Mapping[str, Handler] = {"ping": lambda: {"path": _path(file)}, **handlers}
+        self._handlers: Mapping[str, Handler] = {
+            "ping": lambda: {"path": _path(file).hex()},
+            **handlers,
+        }
         self._closed = threading.Event()
         address, *others = _own_addresses(file)
         self._listeners = {address: _listen(address)}
@@ -123,16 +125,18 @@ class Control:
 
 
 def is_running(file: Path) -> bool:
-    """Whether a process that this user has started with this path still runs.
+    """Whether a process that this user has started with this path still runs, or may do so: one
+    that hangs does not answer, and goes on later.
 
     Another path to the same file does not count: with relative paths in it, its appliance is
     another one. Nor does a stream, such as /dev/stdin, which has another content for each process.
     """
     if file.absolute().is_relative_to("/dev") or file.absolute().is_relative_to("/proc"):
         return False
-    with contextlib.suppress(NotRunning):
-        return ask(file, "ping").get("path") == _path(file)
-    return False
+    try:
+        return ask(file, "ping").get("path") == _path(file).hex()
+    except NotRunning:
+        return any(map(_is_alive, _addresses(file)))
 
 
 def ask(
@@ -269,7 +273,8 @@ def _is_forged(folder: Path) -> bool:
 
 
 def _temporary() -> Path:
-    return Path(tempfile.gettempdir()) / f"holdfast-{_user()}"
+    # Not `tempfile.gettempdir`, which passes over a folder on a full disk: a socket can be there.
+    return Path(os.environ.get("TMPDIR") or "/tmp", f"holdfast-{_user()}")
 
 
 def _user() -> int:
@@ -293,7 +298,7 @@ def _folders_of_others() -> Iterator[Path]:
     """The folders of other units and users, for root, who may open their sockets."""
     yield from sorted(RUN.glob("holdfast-*"))
     named = [(folder, folder.parent.name) for folder in RUN.glob("user/*/holdfast")]
-    for folder in Path(tempfile.gettempdir()).glob("holdfast-*"):
+    for folder in _temporary().parent.glob("holdfast-*"):
         named.append((folder, folder.name.removeprefix("holdfast-")))
     for folder, user in sorted(named):
         # Anybody can make folders for temporary files, with the number of somebody else.
@@ -302,8 +307,9 @@ def _folders_of_others() -> Iterator[Path]:
                 yield folder
 
 
-def _path(file: Path) -> str:
-    return os.path.normpath(file.absolute())
+def _path(file: Path) -> bytes:
+    # In bytes: as text, it depends on the locale of a process.
+    return os.fsencode(os.path.normpath(file.absolute()))
 
 
 def _names(file: Path) -> list[str]:
@@ -312,8 +318,8 @@ def _names(file: Path) -> list[str]:
     The first one stays the same when a link is replaced, the second one finds an appliance that was
     started with another path to the same file.
     """
-    paths = dict.fromkeys((_path(file), str(file.resolve())))
-    digests = [hashlib.sha256(os.fsencode(path)).hexdigest()[:16] for path in paths]
+    paths = dict.fromkeys((_path(file), os.fsencode(file.resolve())))
+    digests = [hashlib.sha256(path).hexdigest()[:16] for path in paths]
     if sys.platform == "win32":
         return [rf"\\.\pipe\holdfast-{digest}" for digest in digests]
     return [f"{digest}.sock" for digest in digests]
