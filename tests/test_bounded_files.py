@@ -114,6 +114,25 @@ def test_other_errors_are_those_of_the_system_and_name_the_file(tmp_path: Path) 
         assert str(caught.value.filename) == str(file)
 
 
+def test_an_error_that_may_pass_ends_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "file"
+
+    def stale(*_: object) -> int:
+        raise OSError(errno.ESTALE, "Stale file handle")
+
+    def work() -> None:
+        with contextlib.suppress(OSError):
+            bounded_files.call(file, os.open, file, os.O_RDONLY)
+
+    monkeypatch.setattr(os, "open", stale)
+    for reading in (FileWork(work), FileWork(lambda: read(file, 100))):
+        with pytest.raises(NotAnswered) as caught:
+            reading.result()
+        assert str(caught.value) == f"{file}: Stale file handle"
+
+
 @pytest.mark.parametrize("function", ["open", "read", "fstat"])
 def test_a_file_that_never_answers_leaves_one_thread_behind(
     function: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -36,6 +36,17 @@ MAX_SECRETS_BYTES = 1 << 20
 
 CHUNK_BYTES = 1 << 20
 
+_PASSING = (
+    errno.EIO,
+    errno.ENFILE,
+    errno.ENOMEM,
+    errno.ENOTCONN,
+    errno.ESTALE,
+    errno.ETIMEDOUT,
+    getattr(errno, "EHOSTDOWN", errno.ETIMEDOUT),
+)
+"""Errors of a system without memory or file descriptors, and of mounts whose server is away."""
+
 _FLAGS = os.O_RDONLY | sum(
     getattr(os, flag, 0) for flag in ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_BINARY")
 )
@@ -55,7 +66,7 @@ class Unreadable(OSError):
 
 
 class NotAnswered(Unreadable):
-    """A file was not read in time."""
+    """A file was not read in time, or an error that may pass prevented it."""
 
 
 class TooLarge(Unreadable):
@@ -63,8 +74,8 @@ class TooLarge(Unreadable):
 
 
 class _Blocked(BaseException):
-    """An earlier thread still waits for the file. Ends all of the work, not the file's part only:
-    with the next file, one more thread could be left behind.
+    """An earlier thread still waits for the file, or its error may pass. Ends all of the work, not
+    the file's part only: with the next file, one more thread could be left behind. Has the error.
     """
 
 
@@ -120,7 +131,7 @@ class FileWork(Generic[T]):
         if self._given_up is not None:
             raise self._given_up
         if isinstance(self._error, _Blocked):
-            raise not_answered(str(self._error), self.timeout_ms)
+            raise self._error.args[0]
         if self._error is not None:
             raise self._error
         return cast("T", self._value)
@@ -129,10 +140,14 @@ class FileWork(Generic[T]):
         """Calls what may wait for a file, in the thread of this work."""
         blocked = {waits[0] for each in self._abandoned if (waits := each._waits) is not None}
         if self._given_up is not None or file in blocked:
-            raise _Blocked(file)
+            raise _Blocked(not_answered(file, self.timeout_ms))
         self._waits = (file, time.monotonic())
         try:
             return function()
+        except OSError as error:
+            if error.errno not in _PASSING:
+                raise
+            raise _Blocked(NotAnswered(error.errno, error.strerror, file)) from error
         finally:
             self._waits = None
 

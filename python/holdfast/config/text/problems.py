@@ -47,7 +47,7 @@ class ConfigError(Exception):
 
 
 class ConfigNotAnswered(ConfigError):
-    """A file was not read in time. The configuration may be valid."""
+    """A file was not read in time, or for now. The configuration may be valid."""
 
     @classmethod
     def of(cls, error: NotAnswered) -> ConfigNotAnswered:
