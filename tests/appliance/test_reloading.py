@@ -71,7 +71,7 @@ class Plant:
     def request(self) -> Mapping[str, Any]:
         """Requests a reload, as `holdfast reload` does. Returns the answer."""
         answers: list[Mapping[str, Any]] = []
-        asking = threading.Thread(target=lambda: answers.append(self.reloading.ask()))
+        asking = threading.Thread(target=lambda: answers.append(self.reloading.ask()), daemon=True)
         asking.start()
         self.step_until(lambda: answers, "the reload was answered")
         asking.join(wire.DEADLINE)
@@ -263,6 +263,18 @@ def test_an_internal_error_of_reading_refuses_the_reload(
     plant = Plant(tmp_path)
     monkeypatch.setitem(globals(), "load_whole", fails)
     assert plant.request() == {"problems": [f"{plant.file}: internal error: KeyError('plant')"]}
+    assert plant.taken == []
+
+
+def test_a_package_that_was_removed_meanwhile_refuses_the_reload(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "holdfast.gateway", None)
+    plant = Plant(tmp_path)
+    gateway = "bind: 127.0.0.1:0, sources: [127.0.0.1], access: read-only, allow: [127.0.0.1]"
+    plant.replace(f"{HEAD}gateway: {{{gateway}, tokens: none}}\n")
+    [problem] = plant.request()["problems"]
+    assert problem.startswith(f"{plant.file}: internal error: ModuleNotFoundError")
     assert plant.taken == []
 
 

@@ -141,6 +141,8 @@ class Reloader:
         before = self._watched(config, hold=True)
         try:
             now = self._load()
+            # It imports what new services need, and the package may have been replaced meanwhile.
+            allow_open_files(now, self._file)
         except Exception as error:  # Raised again by the thread of the appliance.
             return _Read(None, error, before)
         after = self._watched(now, hold=True)
@@ -207,7 +209,6 @@ class Reloader:
             assert read.config is not None, "without an error, there is a configuration"
             config = read.config
             before = self._appliance.config
-            allow_open_files(config, self._file)
             changed = self._appliance.reload(config)
         except ConfigError as error:
             problems = [str(problem) for problem in error.problems]
