@@ -234,6 +234,30 @@ def test_ctrl_c_is_an_exception_again_after_an_import() -> None:
 
 
 @pytest.mark.usefixtures("heard")
+def test_process_1_is_ended_at_once_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in a container. The kernel ignores signals that such a process has no handler for."""
+    codes: list[int] = []
+
+    def receive(number: signal.Signals) -> None:
+        assert signal.getsignal(number) != signal.SIG_DFL
+        signal.raise_signal(number)
+
+    monkeypatch.setattr(os, "getpid", lambda: 1)
+    monkeypatch.setattr(os, "_exit", codes.append)
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    try:
+        with ended_by_ctrl_c():
+            receive(signal.SIGINT)
+        receive(signal.SIGTERM)
+        with interruptions():
+            receive(signal.SIGTERM)
+            receive(signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert codes == [130, 143, 143]
+
+
+@pytest.mark.usefixtures("heard")
 @pytest.mark.parametrize(
     ("name", "words"),
     [("read", ("hr", "0")), ("describe guess", ("hr", "0")), ("describe identify", ())],

@@ -53,18 +53,30 @@ def keep_hangups() -> None:
         signal.signal(hangup, lambda number, _frame: _early_hangups.append(number))
 
 
+def _at_once() -> Callable[[int, FrameType | None], object] | signal.Handlers:
+    """The handler with which a signal ends the process at once.
+
+    For process 1, such as that of a container, the kernel ignores a signal with the usual one.
+    """
+    if os.getpid() == 1:
+        return lambda number, _frame: os._exit(128 + number)
+    return signal.SIG_DFL
+
+
 @contextmanager
 def ended_by_ctrl_c() -> Iterator[None]:
     """Lets Ctrl-C end the process at once, as a stop does, while modules are imported.
 
-    Nothing has begun yet. `KeyboardInterrupt` in the middle of an import shows a traceback, may
-    become a `RuntimeError`, and is lost in a destructor.
+    SIGTERM also ends process 1, from now on. Nothing has begun yet. `KeyboardInterrupt` in the
+    middle of an import shows a traceback, may become a `RuntimeError`, and is lost in a destructor.
     """
     number, usual = signal.SIGINT, signal.default_int_handler
     try:
         is_usual = signal.getsignal(number) == usual
         if is_usual:
-            signal.signal(number, signal.SIG_DFL)
+            signal.signal(number, _at_once())
+        if os.getpid() == 1 and signal.getsignal(signal.SIGTERM) == signal.SIG_DFL:
+            signal.signal(signal.SIGTERM, _at_once())
     except ValueError:  # Only the main thread may set it.
         is_usual = False
     try:
@@ -140,7 +152,7 @@ class Signals:
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
         self.received = True
-        signal.signal(number, signal.SIG_DFL)
+        signal.signal(number, _at_once())
         if self._interrupts:
             self._interrupts = False
             raise Interrupted
