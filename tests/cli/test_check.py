@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -159,6 +160,19 @@ def test_a_command_ends_with_1_if_the_configuration_does_not_answer(
     assert ended.value.code == 1
     reason = "can't be read: no answer within 0.05 s, the limit"
     assert capsys.readouterr().err == f"{good}: {reason}\n1 problem\n"
+
+
+def test_a_command_ends_with_1_if_no_thread_can_start(
+    good: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def start(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    with pytest.raises(SystemExit, match="1"):
+        load_or_exit(good)
+    reason = "no thread to read files with: can't start new thread"
+    assert capsys.readouterr().err == f"holdfast: {reason}\n"
 
 
 def test_schema_prints_the_schema() -> None:

@@ -262,6 +262,19 @@ def test_of_two_that_start_at_the_same_time_one_ends(
     assert "another appliance of this user runs it" in capsys.readouterr().err
 
 
+def test_one_that_can_start_no_thread_ends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def configure(*_: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr("holdfast.events.log_lines.configure", configure)
+    unused: Any = SimpleNamespace(log=SimpleNamespace(level="info", format="text"))
+    with pytest.raises(SystemExit, match="1"):
+        run.serve(unused, unused)
+    assert capsys.readouterr().err == "holdfast: can't start new thread\n"
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="needs symbolic links")
 def test_another_path_to_the_same_file_can_be_started(running: Running) -> None:
     other = running.file.with_name("other.yaml")

@@ -11,7 +11,7 @@ import click
 from holdfast.appliance.parts import certificate_expiry
 from holdfast.appliance.parts.native_listeners import server_tls
 from holdfast.appliance.services.services import https
-from holdfast.cli.exit_codes import ExitCode
+from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.terminal_text import show_problems
 from holdfast.client.endpoint import check_files, endpoint, receiver_endpoint
 from holdfast.config import ConfigError
@@ -21,6 +21,7 @@ from holdfast.config.models.services import HTTP_SERVICES
 from holdfast.config.text.problems import ConfigNotAnswered
 from holdfast.config.text.report import Report
 from holdfast.runtime.bounded_files import NotAnswered, answered
+from holdfast.runtime.text import file_error_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -122,6 +123,8 @@ def load_or_exit(path: Path | str, *, shows_warnings: bool = True) -> Config:
         # Service managers start nothing again after `WRONG`, but a mount may answer later.
         is_answered = not isinstance(error, ConfigNotAnswered)
         sys.exit(ExitCode.WRONG if is_answered else ExitCode.FAILED)
+    except OSError as error:  # No thread can start.
+        fail(file_error_text(error))
     for warning in config.warnings if shows_warnings else ():
         click.echo(f"warning: {warning}", err=True)
     return config

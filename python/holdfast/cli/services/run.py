@@ -6,7 +6,7 @@ import logging
 import os
 import shutil
 import sys
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -41,7 +41,7 @@ from holdfast.runtime.text import file_error_text
 from holdfast.types import BIT_AREAS, REGISTER_AREAS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator, Mapping
 
     from holdfast.appliance.parts.listeners import ListenAddress
     from holdfast.appliance.windows_service.control import ServiceControl
@@ -82,6 +82,18 @@ def run(file: Path) -> None:
     serve(config, lambda appliance: _greeting(appliance, file), file=file)
 
 
+@contextmanager
+def _threads_or_exit() -> Iterator[None]:
+    """Exits with 1 if the system allows no more threads, as by `TasksMax=` of a unit."""
+    try:
+        yield
+    except RuntimeError as error:
+        if str(error) != "can't start new thread":
+            raise
+        fail(error)
+
+
+@_threads_or_exit()
 def serve(
     config: Config,
     greeting: Callable[[Appliance], str],
