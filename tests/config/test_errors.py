@@ -163,6 +163,13 @@ def test_a_memory_is_checked(folder: Folder, old: str, new: str, problem: str) -
     assert folder.problems(changed(old, new)) == [f"p.yaml:{problem}"]
 
 
+def test_initial_values_in_another_encoding_are_found_at_their_line(folder: Folder) -> None:
+    (folder.path / "v.csv").write_bytes(b"area,address,value\ncoils,1,\xb9\n")
+    assert folder.problems(changed("coils: 8", "coils: 8, initial: v.csv")) == [
+        "v.csv:2: not UTF-8, allowed: YAML or CSV in UTF-8"
+    ]
+
+
 def test_a_memory_has_an_area(folder: Folder) -> None:
     assert folder.problems("memories:\n  plant: {}\n" + LISTENERS) == [
         "p.yaml:2: memories.plant: no area, allowed: at least one of "

@@ -51,7 +51,7 @@ class _Given(NamedTuple):
     value: object
 
 
-def read(path: Path, file: str, areas: Mapping[str, range | None]) -> str:
+def read(path: Path, file: str, areas: Mapping[str, range | None]) -> bytes:
     """Reads a file of initial values; messages call it `file`. Raises `ConfigError`.
 
     All values of `areas`, each in a line of its own, are not too large.
@@ -63,11 +63,11 @@ def read(path: Path, file: str, areas: Mapping[str, range | None]) -> str:
     counts = _counts(areas)
     # One more line of each area, for its name.
     most = sum(len(line) * (count + 1) for line, count in zip(lines, counts, strict=True))
-    return yaml_document.read_text(path, file, "YAML or CSV", max(least, most))
+    return yaml_document.read_bytes(path, file, max(least, most))
 
 
 def parse(
-    text: str, file: str, areas: Mapping[str, range | None]
+    content: bytes, file: str, areas: Mapping[str, range | None]
 ) -> tuple[tuple[InitialRun, ...], list[Problem]]:
     """Returns the values of a file as runs, and the problems of the file.
 
@@ -75,6 +75,7 @@ def parse(
     """
     judge = _Judge(file, areas)
     try:
+        text = yaml_document.decoded(content, file, "YAML or CSV")
         for given in (
             _csv(text, judge) if Path(file).suffix.lower() == ".csv" else _yaml(text, judge)
         ):

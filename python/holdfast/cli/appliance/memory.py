@@ -90,8 +90,8 @@ def import_(file: Path, values: Path, name: str | None, merge: bool) -> None:
     areas = found[chosen]
     try:
         spans: dict[str, range | None] = {area: kept.addresses for area, kept in areas.items()}
-        text = read(values, str(values), spans)
-        runs, problems = parse(text, str(values), spans)
+        content = read(values, str(values), spans)
+        runs, problems = parse(content, str(values), spans)
     except ConfigError as error:
         runs, problems = (), list(error.problems)
     if problems:

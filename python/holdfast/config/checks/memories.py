@@ -133,11 +133,11 @@ def _check_initial(scope: Scope, path: KeyPath, memory: MemoryConfig) -> None:
     with until_invalid():
         places |= {f"file:{number}": range(records) for number, records in memory.files.items()}
     try:
-        text = initial_values.read(memory.initial, shown, places)
+        content = initial_values.read(memory.initial, shown, places)
     except ConfigError as error:
         report.add(path, f"found {show(file)}, which {error.problems[0].message}")
         return
-    runs, problems = initial_values.parse(text, shown, places)
+    runs, problems = initial_values.parse(content, shown, places)
     if gate is not None:
         taken = initial_values.sealed(runs, gate)
         if taken != runs:
