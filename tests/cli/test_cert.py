@@ -262,7 +262,7 @@ def test_a_write_that_fails_is_reported_with_its_reason(
 
     monkeypatch.setattr(os, "fsync", full)
     told = Pki(tmp_path).refuses("ca", "Plant authority")
-    assert told == f"holdfast: [Errno {errno.ENOSPC}] No space left on device"
+    assert told == f"holdfast: {tmp_path / 'ca.key'}: No space left on device"
     assert list(tmp_path.iterdir()) == []
 
 

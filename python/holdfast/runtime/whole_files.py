@@ -26,7 +26,7 @@ files with keys, and of files that others must be able to read."""
 def write_new(contents: Mapping[Path, tuple[bytes, int]]) -> None:
     """Writes new files, each with its content and mode: all of them, or none.
 
-    Raises `FileExistsError` if there is one of them, and `OSError`.
+    Raises `FileExistsError` if there is one of them, and `OSError` with the name of the file.
     """
     for file in contents:
         if file.exists():
@@ -41,7 +41,9 @@ def write_new(contents: Mapping[Path, tuple[bytes, int]]) -> None:
                 opened.flush()
                 # After a power cut, an empty file could take the place of a secret for good.
                 os.fsync(opened.fileno())
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(file)
         for file in written:
             file.unlink(missing_ok=True)
         raise

@@ -31,6 +31,7 @@ from holdfast.net.certificates import inspection
 from holdfast.net.certificates.parser import certificates, key_pem
 from holdfast.net.certificates.pem import UnusableFile, content, is_locked, passphrase
 from holdfast.runtime import whole_files
+from holdfast.runtime.text import file_error_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -143,8 +144,7 @@ def _reporting(command: Command) -> Command:
         except (UnusableFile, making.Refused, FileExistsError) as error:
             fail(error, ExitCode.WRONG, reason="file")
         except OSError as error:
-            message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-            fail(message, ExitCode.WRONG, reason="file")
+            fail(file_error_text(error), ExitCode.WRONG, reason="file")
 
     return reported  # type: ignore[return-value]
 
