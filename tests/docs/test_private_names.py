@@ -27,6 +27,9 @@ PRODUCT = ROOT / "python" / "holdfast"
 UNDOCUMENTED = ("nats.aio.transport", "nats.protocol", "ruamel.yaml.scanner")
 """Modules that nothing in their package's documentation speaks of."""
 
+DOCUMENTED = ("_exit",)
+"""Names that only look private: `os._exit`."""
+
 VARIABLES = {"net/nats/batch.py": {"client": "nats.aio.client.Client"}}
 """What variables hold that a file takes private names of, by their names."""
 
@@ -124,7 +127,7 @@ def is_foreign(module: str | None) -> bool:
 
 
 def is_hidden(name: str) -> bool:
-    return name.startswith("_") and not name.endswith("__")
+    return name.startswith("_") and not name.endswith("__") and name not in DOCUMENTED
 
 
 def is_private(dotted: str) -> bool:
