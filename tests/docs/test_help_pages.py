@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 TROUBLES = (DOCS / "troubleshooting.md").read_text()
-OF_THE_SYSTEM = {"timed out", "Name or service not known", *map(os.strerror, errno.errorcode)}
+OF_RESOLVERS = {"Name or service not known", "Temporary failure in name resolution"}
+OF_THE_SYSTEM = {"timed out", *OF_RESOLVERS, *map(os.strerror, errno.errorcode)}
 
 
 def column(text: str, title: str) -> list[str]:
