@@ -224,7 +224,7 @@ def test_readings_are_numbered_in_the_order_in_which_they_leave(
     buffer = Buffer(4)
     buffer.stored = opened(tmp_path / "b.db")
     buffer.offer(polls(2))
-    buffer.keep(60)
+    buffer.move_to_file(60)
     buffer.offer(polls(3, 2))
     assert (buffer.first_number, buffer.next_number) == (0, 5)
     buffer.take(1, 0)
