@@ -13,7 +13,6 @@ import pytest
 from nats.errors import NoRespondersError
 
 from holdfast.net.nats import connection as broker
-from holdfast.net.nats import tolerant_client
 from holdfast.net.nats.connection import Servers
 from holdfast.net.tls import Tls
 from holdfast.scanner.service import Scanner
@@ -82,22 +81,6 @@ def test_tls_is_spoken_with_a_server_that_the_authority_vouches_for(
     server = serve_nats("--tls", *certified(authority, "nats"))
     url = server.url.replace("nats", scheme)
     assert run_scanner(servers=Servers((url,), tls=Tls.of(authority.ca))).serves
-
-
-def test_a_server_may_say_nothing_before_tls(
-    run_scanner: Run,
-    serve_nats: Serve,
-    authority: Certificates,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(tolerant_client, "GREETING_TIMEOUT_S", 0.01)
-    certificate, key = authority.issue("nats", "IP:127.0.0.1")
-    (tmp_path / "nats.conf").write_text(
-        f'tls {{cert_file: "{certificate}", key_file: "{key}", handshake_first: true}}'
-    )
-    server = serve_nats("-c", str(tmp_path / "nats.conf"))
-    assert run_scanner(servers=Servers((server.url,), tls=Tls.of(authority.ca))).serves
 
 
 def test_a_server_that_the_authority_does_not_vouch_for_is_refused(

@@ -40,9 +40,6 @@ if TYPE_CHECKING:
 END = b"\r\n"
 CHUNK_BYTES = 65_536
 PING, PONG = b"PING\r\n", b"PONG\r\n"
-GREETING_TIMEOUT_S = 1.0
-"""Seconds until a server counts as one that says nothing before TLS. It waits for TLS 2 s."""
-
 CLOSE_TIMEOUT_S = 1.0
 """Seconds to send the last bytes of a connection that is closed."""
 
@@ -114,8 +111,6 @@ class MessageTransport(TcpTransport):
         self._channel: SecureChannel | None = None
         self._early = b""
         """What was decrypted and is not read yet."""
-        self._greeting = b""
-        """The first line of the server, until it is read."""
         self.errors: deque[str] = deque()
         """The errors of the server that nats-py has not parsed yet: its parser changes the case."""
         self._pings: deque[tuple[float, bool]] = deque()
@@ -147,7 +142,7 @@ class MessageTransport(TcpTransport):
         self.close()
         self._buffer.clear()
         self._head = None
-        self._early = self._greeting = b""
+        self._early = b""
         self.errors.clear()
         self._pings.clear()
         await super().connect(uri, buffer_size, connect_timeout)
@@ -178,8 +173,6 @@ class MessageTransport(TcpTransport):
 
         Raises `OSError` for a server that is not trusted, and for unusable files.
         """
-        if self._channel is not None:
-            return  # It began before the first line, which asks for it.
         files = ssl_context if isinstance(ssl_context, Tls) else NO_FILES
         host = uri if isinstance(uri, str) else str(uri.hostname)
         channel = SecureChannel(host, files)
@@ -192,16 +185,6 @@ class MessageTransport(TcpTransport):
             self.close()
             raise
         self._channel = channel
-
-    async def waits_for_tls(self) -> bool:
-        """Whether the server says nothing before TLS: it has the setting `handshake_first`."""
-        if self._requires_tls:
-            try:
-                async with asyncio.timeout(GREETING_TIMEOUT_S):
-                    self._greeting = await self._line()
-            except TimeoutError:
-                return True
-        return False
 
     async def _decrypted(self, channel: SecureChannel, buffer_size: int) -> bytes:
         data: bytes = await super().read(buffer_size)
@@ -245,9 +228,6 @@ class MessageTransport(TcpTransport):
         return line
 
     async def _line(self) -> bytes:
-        greeting, self._greeting = self._greeting, b""
-        if greeting:
-            return greeting
         if self._channel is None:
             try:
                 line: bytes = await super().readline()  # type: ignore[no-untyped-call]
@@ -454,7 +434,6 @@ class SafeClient(Client):
 
     async def _process_connect_init(self) -> None:
         self.loss_reason = CONNECTION_LOST
-        self.options["tls_handshake_first"] = await self.transport.waits_for_tls()
         await super()._process_connect_init()
 
     async def _process_info(self, info: dict[str, Any], initial_connection: bool = False) -> None:
