@@ -152,9 +152,6 @@ class Site:
     def tags(self) -> dict[str, list[Tag]]:
         return {}
 
-    def tagged_since(self) -> dict[str, float]:
-        return {}
-
     def answering(self) -> dict[str, bool]:
         return {}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import queue
-import time
 import urllib.request
 from collections import deque
 from types import SimpleNamespace
@@ -426,7 +425,7 @@ def test_a_reload_keeps_the_values_of_the_same_machine_and_tags(
     found = TagValues(cast("Any", Polls()))
     before = adopt(found, load(saved(tmp_path, made)))
     found._handle(deque([(before["m"], 0.0, registers(10))]))
-    state = found.answers, found.tagged_since, len(found.latest())
+    state = found.answers, len(found.latest())
     revision = found.revision
     if is_tag_changed:
         changed = {"power": power_tag | {"description": "of all phases", "writable": True}}
@@ -437,7 +436,7 @@ def test_a_reload_keeps_the_values_of_the_same_machine_and_tags(
     tagged = found.tagged(config, config.devices)
     assert found.adopt(config, tagged) == set(), "nothing has to be read at once"
     assert {"m": tagged["m"].reported_as} == before
-    assert (found.answers, found.tagged_since, len(found.latest())) == state
+    assert (found.answers, len(found.latest())) == state
     assert found.revision == revision + is_tag_changed
     assert all(found.find("m", each.name) is each.tag for each in found.latest())
     found._handle(deque([(before["m"], 0.0, registers(20))]))
@@ -498,28 +497,6 @@ def test_after_a_reload_a_device_is_read_at_once(
             wire.until(lambda: values(tmp_path, "new") == [0], "the new one is there")
         tags = {reading.name for reading, _ in appliance.diagnostics.tag_values()}
     assert tags == made["profiles"]["meter"]["tags"].keys()
-
-
-def test_a_device_has_its_tags_since_the_reload_that_changed_them_or_moved_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = settings(502)
-    made["devices"]["other"] = dict(made["devices"]["m"])
-    polls: Any = Polls()
-    found = TagValues(polls)
-    monkeypatch.setattr(time, "time", lambda: 100.0)
-    adopt(found, load(saved(tmp_path, made)))
-    made["devices"]["m"]["tags"] = {"new": {"area": "coils", "address": 1}}
-    monkeypatch.setattr(time, "time", lambda: 200.0)
-    adopt(found, load(saved(tmp_path, made)))
-    assert found.tagged_since == {"m": 200.0, "other": 100.0}
-    made["devices"]["other"]["unit"] = 2
-    monkeypatch.setattr(time, "time", lambda: 300.0)
-    adopt(found, load(saved(tmp_path, made)))
-    assert found.tagged_since == {"m": 200.0, "other": 300.0}
-    del made["devices"]["m"]
-    adopt(found, load(saved(tmp_path, made)))
-    assert found.tagged_since == {"other": 300.0}
 
 
 def test_a_device_that_another_node_polls_has_no_values(tmp_path: Path) -> None:

@@ -92,9 +92,6 @@ class Site:
     def tags(self) -> dict[str, Any]:
         return {}
 
-    def tagged_since(self) -> dict[str, float]:
-        return {}
-
     def devices(self) -> dict[str, Any]:
         return {}
 

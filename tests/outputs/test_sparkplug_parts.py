@@ -51,7 +51,7 @@ def node(*readings: Reading, waiting: int = 0) -> EdgeNode:
     """A node in a session, with a device of these current values, and so many that wait."""
     made = EdgeNode(Names("group", "edge"), lambda: waiting)
     made.begin()
-    made.adopt({"pump": [SPEED, LEVEL]}, {})
+    made.adopt({"pump": [SPEED, LEVEL]})
     list(made.births({"pump": True}, lambda: latest(*readings)))
     return made
 
@@ -287,7 +287,7 @@ def test_unsigned_integers_of_32_bits_are_long(type: str, field: str) -> None:
     tag = Tag("speed", "input_registers", 0, type)
     made = EdgeNode(Names("group", "edge"), int)
     made.begin()
-    made.adopt({"pump": [tag]}, {})
+    made.adopt({"pump": [tag]})
     *_, birth = made.births({"pump": True}, lambda: latest(reading(7, 1.0, tag)))
     [data] = made.data([reading(8, 2.0, tag)], latest, 0)
     for message, value in ((birth, 7), (data, 8)):
@@ -300,7 +300,7 @@ def test_unsigned_integers_of_32_bits_are_long(type: str, field: str) -> None:
 def test_data_has_types_if_they_are_always_wanted(always_typed: bool) -> None:
     made = EdgeNode(Names("group", "edge"), int, always_typed=always_typed)
     made.begin()
-    made.adopt({"pump": [SPEED]}, {})
+    made.adopt({"pump": [SPEED]})
     *_, birth = made.births({"pump": True}, lambda: latest(reading(0, 10.0)))
     found = [payload(birth).metrics[0]]
     for some in (reading(3, 8.0), reading(5, 11.0), reading(None, 12.0, fault=2)):
@@ -332,7 +332,7 @@ def test_a_birth_has_type_and_value_of_each_metric(
     tag = Tag("speed", area, 0, type)
     made = EdgeNode(Names("group", "edge"), int)
     made.begin()
-    made.adopt({"pump": [tag]}, {})
+    made.adopt({"pump": [tag]})
     *_, birth = made.births({"pump": True}, lambda: latest(reading(value, 1.0, tag)))
     [metric] = payload(birth).metrics
     assert (metric.name, metric.datatype, metric.is_null) == ("speed", number, False)
@@ -346,7 +346,7 @@ def test_messages_have_the_time_now_and_metrics_the_time_of_their_reading(
     now = 1_700_000_000_250
     made = EdgeNode(Names("group", "edge"), int)
     made.begin()
-    made.adopt({"pump": [SPEED, LEVEL]}, {})
+    made.adopt({"pump": [SPEED, LEVEL]})
     births = list(made.births({"pump": True}, lambda: latest(reading(5, 10.5))))
     data = list(made.data([reading(3, 8.25), reading(6, 11.75)], latest, 0))
     messages = [*births, *data, *made.device_deaths({"pump": False}), made.death()]
@@ -370,7 +370,7 @@ def test_messages_have_the_time_now_and_metrics_the_time_of_their_reading(
 def test_all_messages_but_the_death_of_the_node_are_numbered_from_its_birth() -> None:
     made = EdgeNode(Names("group", "edge"), int)
     made.begin()
-    made.adopt({"pump": [SPEED], "fan": [SPEED]}, {})
+    made.adopt({"pump": [SPEED], "fan": [SPEED]})
     births = made.births({"pump": True, "fan": True}, latest)
     data = list(made.data([reading(3, 8.0)], latest, 0))
     deaths = made.device_deaths({"pump": False, "fan": True})
@@ -413,16 +413,16 @@ def test_what_a_birth_has_is_not_repeated_and_what_is_older_is_historical() -> N
 @pytest.mark.parametrize("of", [None, Tag("speed", "input_registers", 0, "string:2")])
 def test_after_a_birth_without_value_a_poll_from_before_it_is_current(of: Tag | None) -> None:
     now = time.time()
-    made = EdgeNode(Names("group", "edge"), int)
+    # One has waited since before a restart or a reload.
+    made = EdgeNode(Names("group", "edge"), lambda: 1)
     made.begin()
-    made.adopt({"pump": [SPEED]}, {"pump": now - 2})
+    made.adopt({"pump": [SPEED]})
     known = () if of is None else (reading("on", now, of),)
     *_, birth = made.births({"pump": True}, lambda: latest(*known))
     [metric] = payload(birth).metrics
     assert (metric.is_null, metric.timestamp >= int(now * 1000)) == (True, True)
     messages = list(made.data([reading(5, now - 3), reading(6, now - 1)], latest, 0))
     found = [payload(message).metrics[0] for message in messages]
-    # The first one waited since before a restart or a reload.
     assert [(metric.int_value, metric.is_historical) for metric in found] == [(5, True), (6, False)]
 
 
@@ -447,7 +447,7 @@ def test_no_value_is_historical_after_the_clock_was_set_back() -> None:
 def test_a_device_without_birth_is_born_for_its_values_and_dies_after_them() -> None:
     made = EdgeNode(Names("group", "edge"), int)
     made.begin()
-    made.adopt({"pump": [SPEED]}, {})
+    made.adopt({"pump": [SPEED]})
     assert kinds(made.births({"pump": False}, latest)) == ["NBIRTH"]
     silent = reading(None, 10.0, fault=FAULTS["timeout"])
     assert kinds(made.data([silent], latest, 0)) == []
@@ -494,7 +494,7 @@ FLOW = Tag("flow", "input_registers", 2, "uint16[2]", null=frozenset({65535}))
 def test_a_value_from_before_a_change_of_its_tag_is_left_out(value: Any, of: Tag) -> None:
     made = EdgeNode(Names("group", "edge"), int)
     made.begin()
-    made.adopt({"pump": [SPEED, LEVEL, FLOW]}, {})
+    made.adopt({"pump": [SPEED, LEVEL, FLOW]})
     list(made.births({"pump": True}, lambda: latest(reading(5, 10.0))))
     old = reading(value, 10.5, of)
     some = [reading(6, 11.0), reading(8, 11.0, LEVEL), old, reading(9, 12.0, LEVEL)]
@@ -512,7 +512,7 @@ def test_a_value_from_before_a_change_of_its_tag_is_left_out(value: Any, of: Tag
 def test_a_birth_has_no_value_from_before_a_change_of_its_tag() -> None:
     made = EdgeNode(Names("group", "edge"), int)
     made.begin()
-    made.adopt({"pump": [SPEED]}, {})
+    made.adopt({"pump": [SPEED]})
     old = reading("on", 10.0, Tag("speed", "input_registers", 0, "string:2"))
     *_, birth = made.births({"pump": True}, lambda: latest(old))
     [metric] = payload(birth).metrics
@@ -528,9 +528,6 @@ class Pump:
 
     def tags(self) -> dict[str, Any]:
         return {"pump": [SPEED]}
-
-    def tagged_since(self) -> dict[str, float]:
-        return {"pump": 0.0}
 
     def devices(self) -> dict[str, Any]:
         return {}
@@ -555,7 +552,7 @@ def test_an_output_refuses_what_is_left_out_and_publishes_the_rest(
     settings = {"type": "sparkplug", "url": "mqtt://h", "group": "g", "edge_node": "e"}
     output = SparkplugOutput("scada", SparkplugConfig.model_validate(settings), Pump())
     output.use_buffer(Buffer())
-    monkeypatch.setattr(output, "_ready", lambda: output._node.adopt({"pump": [SPEED]}, {}))
+    monkeypatch.setattr(output, "_ready", lambda: output._node.adopt({"pump": [SPEED]}))
     monkeypatch.setattr(output, "_publish", lambda _, messages: published.extend(messages))
     with pytest.raises(Refused, match="before their tags were changed") as refused:
         output.send([reading("on", 1.0), reading(5, 2.0)])

@@ -51,7 +51,7 @@ def born(tag: Tag, value: Any) -> tuple[EdgeNode, Any, Any]:
     """A node with the metric of a value: in a birth, and in data without name and type."""
     node = EdgeNode(Names("group", "edge"), int)
     node.begin()
-    node.adopt({"pump": [tag]}, {})
+    node.adopt({"pump": [tag]})
     first = {"pump": {tag.name: Reading("pump", tag, value, 1.0, 0)}}
     *_, birth = node.births({"pump": True}, lambda: first)
     [data] = node.data([Reading("pump", tag, value, 2.0, 0)], dict, 0)

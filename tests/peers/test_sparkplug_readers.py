@@ -37,7 +37,7 @@ def messages(*, always_typed: bool) -> list[dict[str, Any]]:
     """A birth without values, and their data."""
     made = EdgeNode(Names("group", "edge"), int, always_typed=always_typed)
     made.begin()
-    made.adopt({"pump": TAGS}, {})
+    made.adopt({"pump": TAGS})
     *_, birth = made.births({"pump": True}, dict)
     readings = [Reading("pump", tag, value, 2.0**33, 0) for tag, value, *_ in CASES]
     [data] = made.data(readings, dict, 0)
@@ -57,7 +57,7 @@ def test_a_birth_and_typed_data_are_decoded() -> None:
 def test_a_birth_with_values_is_decoded() -> None:
     made = EdgeNode(Names("group", "edge"), int)
     made.begin()
-    made.adopt({"pump": TAGS}, {})
+    made.adopt({"pump": TAGS})
     latest = {"pump": {tag.name: Reading("pump", tag, value, 1.0, 0) for tag, value, *_ in CASES}}
     *_, birth = made.births({"pump": True}, lambda: latest)
     [found] = node("sparkplug-payload").results(

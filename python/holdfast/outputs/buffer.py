@@ -54,8 +54,6 @@ class Buffer:
         self.dropped: int = 0 if before is None else before.dropped
         """Readings that were lost because there was no room."""
         self._dropped_before = self.dropped
-        self._done = 0
-        """Readings of batches that are done."""
 
     def offer(self, polls: Iterable[Sequence[Reading]]) -> None:
         """Adds the readings of polls. If there is no room, the oldest are dropped and counted."""
@@ -115,13 +113,17 @@ class Buffer:
 
     @property
     def first_number(self) -> int:
-        """The number of the oldest reading, in the order of all that were ever in the buffer."""
-        return self._done + self.dropped
+        """The number of the oldest reading, in the order of all that were offered, from 0 on.
+
+        Those from before, of a file or of the output before a reload, have negative numbers.
+        """
+        with self._changed:
+            return self._offered - len(self)
 
     @property
     def next_number(self) -> int:
         """The number of the next reading that is offered."""
-        return self.first_number + len(self)
+        return self._offered
 
     def take(self, max_readings: int, timeout: float) -> list[Reading]:
         """Returns the oldest readings. Waits for the first up to `timeout` seconds.
@@ -170,7 +172,6 @@ class Buffer:
 
         Raises `OSError` if the file fails. Even then, `take` does not return them again.
         """
-        self._done += len(self._batch)
         was_stored, self._batch, self._is_batch_stored = self._is_batch_stored, [], False
         if was_stored:
             assert self.stored is not None, "the batch is in it"

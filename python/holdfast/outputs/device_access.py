@@ -52,9 +52,6 @@ class Site(Protocol):
     def tags(self) -> Mapping[str, Sequence[Tag]]:
         """The tags of each device."""
 
-    def tagged_since(self) -> Mapping[str, float]:
-        """Since when each device has had its tags and address: older readings are of others."""
-
     def devices(self) -> Mapping[str, DeviceInfo]:
         """What is known of each device."""
 

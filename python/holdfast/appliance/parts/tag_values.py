@@ -163,8 +163,6 @@ class TagValues:
         """Changes with the tags of any device, and with `devices`."""
         self.devices: dict[str, DeviceInfo] = {}
         """What is known of each device with tags. Replaced as a whole."""
-        self.tagged_since: dict[str, float] = {}
-        """Since when each device has had its source and its tags. Replaced as a whole."""
         self.retained: dict[tuple[str, str], str] = {}
         """Of each broker and topic that it retains, the output that published it: see `Site`."""
         self.answers = 0
@@ -227,8 +225,6 @@ class TagValues:
                 for name in before.keys() & tagged.keys()
                 if before[name].source != tagged[name].source
             }
-            began = {name: at for name, at in self.tagged_since.items() if name not in changed}
-            self.tagged_since = dict.fromkeys(tagged, time.time()) | began
             # Nobody knows yet whether a new device answers, or another machine.
             answering = {
                 name: self._answering.get(name, False) and name not in moved for name in tagged

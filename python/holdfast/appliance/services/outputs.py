@@ -68,9 +68,6 @@ class _Site:
     def tags(self) -> dict[str, tuple[Tag, ...]]:
         return {name: tags for name, tags in self._values.tags().items() if self._has(name)}
 
-    def tagged_since(self) -> Mapping[str, float]:
-        return self._values.tagged_since
-
     def devices(self) -> Mapping[str, DeviceInfo]:
         return self._values.devices
 

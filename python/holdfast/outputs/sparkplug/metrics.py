@@ -37,21 +37,16 @@ class Entry(NamedTuple):
 class DeviceMetrics:
     """The metrics of one device, and what a host knows of them. For one thread."""
 
-    def __init__(
-        self, device: str, tags: Sequence[Tag], since: float, *, always_typed: bool
-    ) -> None:
-        """`since` is when the device got these tags."""
+    def __init__(self, device: str, tags: Sequence[Tag], *, always_typed: bool) -> None:
         self.device = device
-        self._since = since
         self._always_typed = always_typed
         self._tags = {tag.name: tag for tag in tags}
         self._entries: dict[str, list[Entry]] = {}
         self.by_name: dict[str, Entry] = {}
         """The metrics by name. This and `by_alias` are for all threads."""
         self.by_alias: dict[int, Entry] = {}
-        self._births: dict[str, float] = {}
-        """When the tags had their values of the last birth. Without a value: when the device got
-        its tags, because a poll that was answered before a birth may come after it."""
+        self._births: dict[str, float | None] = {}
+        """When the tags had their values of the last birth, if they had any."""
         self._next_number = 0
         """The readings before this number waited at the last birth, and were not newer than it."""
         self._bad: set[str] = set()
@@ -79,7 +74,7 @@ class DeviceMetrics:
             if reading is not None and not self._is_of_same_meaning(reading):
                 reading = None
             at = time.time() if reading is None else reading.time
-            self._births[name] = self._since if reading is None else at
+            self._births[name] = None if reading is None else at
             for entry in entries:
                 metric = payload.metrics.add(
                     name=entry.name,
@@ -110,12 +105,9 @@ class DeviceMetrics:
         if not self._is_of_same_meaning(reading):
             return False
         # A host stores what is historical, and does not show it as current: after an outage, the
-        # birth has the newest values, and those that waited follow. Their order tells, because the
-        # clock may have been set. Older values that come later are those of a file that could not
-        # be opened at first; if the birth is in the future, the clock was set back since.
-        is_historical = number < self._next_number or (
-            reading.time < self._births[name] <= time.time()
-        )
+        # birth has the newest values, and those that waited follow. Their order shows it: the clock
+        # may have been set.
+        is_historical = number < self._next_number
         entries, first = self._entries[name], len(payload.metrics)
         try:
             have_values = [_fill(payload.metrics.add(), entry, reading.value) for entry in entries]

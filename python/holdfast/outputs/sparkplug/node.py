@@ -90,13 +90,11 @@ class EdgeNode:
         self._add_session(payload)
         return Message(packed_topic(self._names.of("NDEATH")), payload.SerializeToString())
 
-    def adopt(self, tags: Mapping[str, Sequence[Tag]], since: Mapping[str, float]) -> None:
-        """Takes over the tags, before births. `since` is when each device got its tags."""
+    def adopt(self, tags: Mapping[str, Sequence[Tag]]) -> None:
+        """Takes over the tags, before births."""
         # A device may be removed at this moment: the next births are without it.
         self._devices = {
-            device: DeviceMetrics(
-                device, some, since.get(device, 0.0), always_typed=self._always_typed
-            )
+            device: DeviceMetrics(device, some, always_typed=self._always_typed)
             for device, some in tags.items()
         }
 

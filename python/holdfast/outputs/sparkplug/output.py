@@ -132,8 +132,8 @@ class SparkplugOutput(BrokerReceiver):
 
     def _adopt(self, session: Session) -> None:
         """Takes over the tags: of a new session, and after a reload."""
-        tags, since = self._site.tags(), self._site.tagged_since()
-        self._node.adopt(tags, since)
+        tags = self._site.tags()
+        self._node.adopt(tags)
         if self._settings.writes:
             devices = [device for device, some in tags.items() if any(tag.writable for tag in some)]
             topics = [self._names.of("DCMD", device) for device in devices]
