@@ -274,6 +274,33 @@ def test_a_client_is_for_the_unit_it_is_made_for(device: Device, dial: Dial) -> 
     assert dial(device.url, unit=2).read_coils(0, 1) == [True]
 
 
+OTHER_LIBRARIES = {
+    **dict.fromkeys(("unit_id", "address", "slave", "slave_id", "device_id"), "set `unit`"),
+    **dict.fromkeys(("host", "port"), "make a client with another URL"),
+    "handle_local_echo": "set `echo=1` in the URL",
+}
+
+
+@pytest.mark.parametrize("kind", [holdfast.SyncClient, holdfast.Client])
+def test_an_attribute_of_another_library_chooses_no_device(
+    kind: type[holdfast.SyncClient | holdfast.Client],
+) -> None:
+    client = kind("tcp://localhost")
+    for name, instead in OTHER_LIBRARIES.items():
+        with pytest.raises(AttributeError, match=instead):
+            setattr(client, name, 2)
+        assert not hasattr(client, name)
+
+
+def test_a_subclass_may_define_an_attribute_of_another_library() -> None:
+    class Drive(holdfast.SyncClient):
+        address = 0
+
+    drive = Drive("tcp://localhost")
+    drive.address = 7
+    assert (drive.address, Drive.address) == (7, 0)
+
+
 def test_a_closed_client_connects_anew(client: Face) -> None:
     for value in (1, 2, 3):
         client.write_register(0, value)

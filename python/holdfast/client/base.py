@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NoReturn, TypeAlias
 
 from holdfast.client.serial_settings import SerialTarget
 from holdfast.client.url import parse
@@ -28,8 +28,28 @@ MIN_INTERVAL_S, MAX_INTERVAL_S = 0.01, 31_622_400
 BROADCAST = "unit 0 of a serial line is the broadcast"
 
 
+class ForeignAttribute:
+    """An attribute with which other libraries choose the device, or make writes to it safe. If a
+    client took it as its own, it would have no effect. A subclass may define it.
+    """
+
+    def __init__(self, instead: str) -> None:
+        self.__doc__ = f"not an attribute of Holdfast: {instead}"
+
+    def __get__(self, client: object, owner: type) -> NoReturn:
+        raise AttributeError(self.__doc__)
+
+    def __set__(self, client: object, value: object) -> NoReturn:
+        raise AttributeError(self.__doc__)
+
+
 class BaseClient:
     """The settings of a client, checked."""
+
+    if not TYPE_CHECKING:  # Type checkers refuse these names as all that do not exist.
+        unit_id = address = slave = slave_id = device_id = ForeignAttribute("set `unit`")
+        host = port = ForeignAttribute("make a client with another URL")
+        handle_local_echo = ForeignAttribute("set `echo=1` in the URL")
 
     def __init__(self, url: str, unit: int, timeout: float) -> None:
         self.target = parse(url)
