@@ -13,12 +13,18 @@ from support.fake_device import Stream, good
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows does not fork")
 
 FORK = """
-import asyncio, os, sys, threading, holdfast
-KIND, URL = sys.argv[1:]
-client = getattr(holdfast, KIND)(URL)
+import asyncio, copy, os, sys
+from holdfast import Client, SyncClient
+class Equal(SyncClient):
+    def __eq__(self, other):
+        return isinstance(other, Equal)
+    def __hash__(self):
+        return 0
+MADE, URL = sys.argv[1:]
+clients = eval(MADE)
 def read(address):
-    call = client.read_holding_registers(address, 1)
-    return call if KIND == "SyncClient" else asyncio.run(waited(call))
+    call = clients[-1].read_holding_registers(address, 1)
+    return call if isinstance(call, list) else asyncio.run(waited(call))
 async def waited(call):
     return await call
 assert read(1) == [1]
@@ -87,12 +93,22 @@ def python(script: str, *words: str) -> subprocess.Popen[str]:
     )
 
 
-@pytest.mark.parametrize("kind", ["SyncClient", "Client"])
+@pytest.mark.parametrize(
+    "made",
+    [
+        "[SyncClient(URL)]",
+        "[Client(URL)]",
+        "[copy.copy(SyncClient(URL))]",
+        "[copy.copy(Client(URL))]",
+        "[Equal(URL), Equal(URL)]",
+    ],
+)
 @pytest.mark.parametrize("transport", ["tcp", "rtu+tcp"])
-def test_a_forked_child_has_a_connection_of_its_own(kind: str, transport: str) -> None:
-    with Stream(transport) as device, python(FORK, kind, device.url) as parent:
+def test_a_forked_child_has_a_connection_of_its_own(made: str, transport: str) -> None:
+    with Stream(transport) as device, python(FORK, made, device.url) as parent:
         _, errors = parent.communicate(timeout=wire.DEADLINE)
         assert (parent.returncode, errors) == (0, "")
+        assert device.connections > 1
 
 
 def test_a_child_that_is_forked_during_a_call_of_another_thread_has_its_own() -> None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Self
 
-from holdfast._core import BlockingClient
 from holdfast.client.base import DEFAULT_TIMEOUT_S
 from holdfast.client.endpoint import endpoint
-from holdfast.client.fork import renew_in_children
+from holdfast.client.fork import BlockingConnection
 from holdfast.client.sync_operations import SyncOperations
 
 if TYPE_CHECKING:
@@ -51,13 +50,7 @@ class SyncClient(SyncOperations):
         trace: Trace | None = None,
     ) -> None:
         super().__init__(url, unit, timeout)
-        self._endpoint = endpoint(self.target)
-        self._trace = trace
-        self._connect_anew()
-        renew_in_children(self, SyncClient._connect_anew)
-
-    def _connect_anew(self) -> None:
-        self._transport = BlockingClient(self._endpoint, self._trace)
+        self._transport = BlockingConnection(endpoint(self.target), trace)
 
     def close(self) -> None:
         """Closes the connection after the calls before it. A later call reconnects."""

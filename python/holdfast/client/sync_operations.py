@@ -14,7 +14,7 @@ from holdfast.client.base import BaseClient
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from holdfast._core import BlockingClient
+    from holdfast.client.fork import BlockingConnection
     from holdfast.client.identification import Identification
     from holdfast.client.requests import EventLog, Plan, Result, ServerId
     from holdfast.types import (
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 class SyncOperations(BaseClient):
     """The operations of a client; a subclass sets the transport."""
 
-    _transport: BlockingClient
+    _transport: BlockingConnection
 
     def read_coils(self, address: int, count: int, *, unit: int | None = None) -> list[bool]:
         """Reads `count` coils (function 1). More than 2000 take several requests."""
