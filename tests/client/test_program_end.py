@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from support import wire
+from support.brokers import free_port
 from support.fake_device import ScriptedDevice, Stream, Udp, silent
 
 IN_A_DAEMON_THREAD = """
@@ -142,6 +143,17 @@ call = lambda: plc.call(Request.read("coils", 0, 1), 1, 90, has_begun.set)
 """
 
 
+FAILS_AT_THE_END = """
+import sys, holdfast
+class Drive:
+    def __init__(self):
+        self.plc = holdfast.SyncClient(sys.argv[1])
+    def __del__(self):
+        self.plc.write_register(0, 0)
+sys.modules["drive"] = Drive()  # Is deleted when nothing can be imported any more.
+"""
+
+
 def ended(program: str, url: str) -> subprocess.CompletedProcess[bytes]:
     command = [sys.executable, "-c", program, url]
     return subprocess.run(command, capture_output=True, timeout=wire.DEADLINE, check=False)
@@ -190,3 +202,10 @@ def test_a_call_in_a_daemon_thread_ends_with_the_interpreter(call: str) -> None:
     command = [sys.executable, "-c", CALLED_IN_A_DAEMON_THREAD.replace("CALL", call)]
     end = subprocess.run(command, capture_output=True, timeout=wire.DEADLINE, check=False)
     assert (end.returncode, end.stderr) == (0, b"")
+
+
+def test_a_call_that_fails_at_the_end_of_the_interpreter_is_reported() -> None:
+    end = ended(FAILS_AT_THE_END, f"tcp://127.0.0.1:{free_port()}")
+    assert end.stderr.startswith(b"Exception ignored in")
+    assert b"holdfast.errors.ConnectFailed: can't connect to" in end.stderr
+    assert end.returncode == 0

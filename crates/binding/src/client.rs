@@ -20,6 +20,7 @@ use holdfast_protocol::pdu::{
 };
 use pyo3::exceptions::{PyException, PyOSError, PyPermissionError, PyRuntimeError, PyValueError};
 use pyo3::prelude::*;
+use pyo3::sync::PyOnceLock;
 use pyo3::types::{PyBytes, PyList};
 use pyo3::{PyTraverseError, PyVisit};
 
@@ -215,7 +216,7 @@ pub struct Endpoint {
 #[allow(clippy::too_many_arguments, reason = "they are keywords in Python")]
 impl Endpoint {
     #[staticmethod]
-    fn network(transport: &str, host: String, port: u16) -> PyResult<Endpoint> {
+    fn network(py: Python<'_>, transport: &str, host: String, port: u16) -> PyResult<Endpoint> {
         let core = match transport {
             "tcp" => Place::Tcp { host, port, tls: None },
             "rtu+tcp" => Place::RtuOverTcp { host, port },
@@ -227,7 +228,7 @@ impl Endpoint {
                 return Err(unknown("transport", transport, allowed));
             }
         };
-        Ok(Endpoint { core: core.into() })
+        Endpoint::new(py, core)
     }
 
     #[staticmethod]
@@ -252,12 +253,13 @@ impl Endpoint {
         // Reading may block: let other Python threads run.
         let tls = py.detach(|| ClientTls::new(settings));
         let tls = Some(Arc::new(tls.map_err(unusable)?));
-        Ok(Endpoint { core: Place::Tcp { host, port, tls }.into() })
+        Endpoint::new(py, Place::Tcp { host, port, tls })
     }
 
     #[staticmethod]
     #[pyo3(signature = (device, *, mode, baud, parity, stop_bits, data_bits, silence=None, rs485=None))]
     fn serial(
+        py: Python<'_>,
         device: String,
         mode: &str,
         baud: i128,
@@ -268,7 +270,7 @@ impl Endpoint {
         rs485: Option<String>,
     ) -> PyResult<Endpoint> {
         let line = line(device, mode, baud, parity, stop_bits, data_bits, silence, rs485)?;
-        Ok(Endpoint { core: Place::Serial(line).into() })
+        Endpoint::new(py, Place::Serial(line))
     }
 
     #[pyo3(signature = (*, accept_unit=None, pad=false, echo=None, pause=0.0, pause_after_connect=0.0, retries=0, retry_busy=false, close_after=0, reconnect=0.0, write_multiple=false))]
@@ -310,6 +312,30 @@ impl Endpoint {
         };
         Ok(Endpoint { core: CoreEndpoint { place: self.core.place.clone(), tolerance } })
     }
+}
+
+impl Endpoint {
+    fn new(py: Python<'_>, place: Place) -> PyResult<Endpoint> {
+        import_exceptions(py)?;
+        Ok(Endpoint { core: place.into() })
+    }
+}
+
+/// Imports the exceptions that requests raise. While a program ends, nothing can be imported any more:
+/// a request in a `__del__` that was the first to fail would abort the process.
+fn import_exceptions(py: Python<'_>) -> PyResult<()> {
+    static ARE_IMPORTED: PyOnceLock<()> = PyOnceLock::new();
+    let import = || {
+        py.import("holdfast.errors")?; // `get_type` panics if it can't.
+        py.get_type::<ModbusException>();
+        py.get_type::<ConnectFailed>();
+        py.get_type::<ConnectionLost>();
+        py.get_type::<RequestTimeout>();
+        py.get_type::<InvalidResponse>();
+        py.get_type::<TlsFailed>();
+        Ok(())
+    };
+    ARE_IMPORTED.get_or_try_init(py, import).copied()
 }
 
 #[pyclass(frozen, module = "holdfast")]
