@@ -1105,7 +1105,11 @@ class BlockingClient:
         """Ends the call that waits for its reply, within 0.1 s: it raises `ConnectionLost`."""
 
     def close(self) -> None:
-        """Closes the connection; the next call reconnects."""
+        """Closes the connection after the calls before it; the next call reconnects.
+
+        Within a call of this thread, as a signal handler or trace, it waits for nothing, and ends
+        the calls of all threads.
+        """
 
     @property
     def late(self) -> int:

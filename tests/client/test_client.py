@@ -1631,6 +1631,26 @@ def test_a_call_that_is_cancelled_in_a_pause_ends_before_it() -> None:
         assert device.requests == []
 
 
+def test_a_call_that_closes_its_client_ends_the_calls_of_all_threads() -> None:
+    with Stream("tcp", silent) as device, ThreadPoolExecutor(1) as executor:
+        client = BlockingClient(endpoints.endpoint(parse(device.url)))
+        write = Request.write_register(0, 1)
+
+        def close() -> bool:  # Asked while its call waits for its turn.
+            client.close()
+            return False
+
+        first = executor.submit(client.call, write, 1, 4 * wire.DEADLINE)
+        device.await_requests(1)
+        with pytest.raises(holdfast.ConnectionLost) as waiting:
+            client.call(write, 1, wire.DEADLINE, close)
+        with pytest.raises(holdfast.ConnectionLost) as sent:
+            first.result(wire.DEADLINE)
+        assert (waiting.value.maybe_sent, sent.value.maybe_sent) == (False, True)
+        assert client.call(Request.read("holding_registers", 7, 1), 1, wire.DEADLINE) == [7]
+        assert len(device.requests) == device.connections == 2
+
+
 def test_a_pause_before_the_next_connection_may_be_longer_than_the_timeout(dial: Dial) -> None:
     def hang_up(asked: Asked) -> None:
         asked.answer()

@@ -1488,29 +1488,68 @@ def test_a_signal_ends_a_handshake(tmp_path: Path) -> None:
             client.read_holding_registers(0, 1)
 
 
+@contextmanager
+def handled_when(happens: Callable[[], bool], handle: Callable[[], object]) -> Iterator[None]:
+    """Runs a signal handler once a condition is true."""
+
+    def interrupt() -> None:
+        wire.until(happens, "the device has been asked")
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
+
+    thread = threading.Thread(target=interrupt)
+    before = signal.signal(signal.SIGUSR1, lambda *_: handle())
+    try:
+        thread.start()
+        yield
+    finally:
+        thread.join()
+        signal.signal(signal.SIGUSR1, before)
+
+
 def test_a_handler_that_does_not_raise_leaves_the_call_alone(make: Make) -> None:
     device = make("tcp", silent)
     refused: list[str] = []
 
-    def handle(*_: object) -> None:
+    def handle() -> None:
         try:
             client.read_holding_registers(0, 1)
         except RuntimeError as error:
             refused.append(str(error))
         device.requests[0].answer()
 
-    def interrupt() -> None:
-        wire.until(lambda: len(device.requests) == 1, "the device has been asked")
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
+    with (
+        holdfast.SyncClient(device.url, timeout=LONG) as client,
+        handled_when(lambda: len(device.requests) == 1, handle),
+    ):
+        assert client.read_holding_registers(7, 2) == [7, 8]
+    [why] = refused
+    assert why.startswith("this client is waiting for a reply")
 
-    before = signal.signal(signal.SIGUSR1, handle)
-    thread = threading.Thread(target=interrupt)
-    try:
-        with holdfast.SyncClient(device.url, timeout=LONG) as client:
-            thread.start()
-            assert client.read_holding_registers(7, 2) == [7, 8]
-        [why] = refused
-        assert why.startswith("this client is waiting for a reply")
-    finally:
-        thread.join()
-        signal.signal(signal.SIGUSR1, before)
+
+@pytest.mark.parametrize("kind", [*STREAMS, *DATAGRAMS, *LINES])
+def test_a_handler_that_closes_the_client_ends_the_call(kind: str, make: Make) -> None:
+    device = make(kind, silent)
+    with holdfast.SyncClient(device.url, timeout=LONG) as client:
+        with (
+            handled_when(lambda: len(device.requests) == 1, client.close),
+            pytest.raises(holdfast.ConnectionLost) as lost,
+        ):
+            client.write_register(7, 2)
+        assert lost.value.maybe_sent
+
+        assert client.read_holding_registers(5, 1) == [5]
+
+
+def test_a_handler_that_closes_the_client_can_end_the_program(make: Make) -> None:
+    device = make("tcp", silent)
+    client = holdfast.SyncClient(device.url, timeout=LONG)
+
+    def handle() -> None:
+        client.close()
+        sys.exit(7)
+
+    with (
+        handled_when(lambda: len(device.requests) == 1, handle),
+        pytest.raises(SystemExit, match="7"),
+    ):
+        client.write_register(7, 2)

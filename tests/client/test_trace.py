@@ -114,6 +114,17 @@ def test_the_trace_cannot_use_its_client() -> None:
     assert len(refused) == 2
 
 
+def test_a_trace_that_closes_its_client_closes_the_connection_after_the_reply() -> None:
+    def trace(direction: str, _data: bytes) -> None:
+        if direction == "received":
+            plc.close()
+
+    with Stream("tcp") as device, holdfast.SyncClient(device.url, trace=trace) as plc:
+        for address in (7, 8):
+            assert plc.read_holding_registers(address, 1) == [address]
+        assert device.connections == 2
+
+
 def test_a_trace_within_a_call_of_another_trace_cannot_use_the_client_of_either() -> None:
     refused: list[str] = []
 

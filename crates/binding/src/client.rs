@@ -411,7 +411,13 @@ impl BlockingClient {
         self.ended.fetch_add(1, Ordering::Relaxed);
     }
 
+    /// Within a call of this thread: a signal handler or the trace waits for nothing, and ends that call.
     fn close(&self, py: Python<'_>) -> PyResult<()> {
+        if self.is_calling() {
+            self.core.close_after_call();
+            self.end_call();
+            return Ok(());
+        }
         self.interruptible(py, || false, |interrupted| self.core.close(Some(interrupted)))
     }
 
@@ -434,7 +440,8 @@ impl BlockingClient {
 
 thread_local! {
     /// The clients with a call in this thread, as addresses. Signal handlers and the trace run within
-    /// a call: one that called its client, directly or within a call of another, would wait for ever.
+    /// a call: one that called its client, directly or within a call of another, would wait for ever. It
+    /// can only close it.
     static CALLING: RefCell<Vec<usize>> = const { RefCell::new(Vec::new()) };
 
     /// What a signal handler has raised in the trace of a call in this thread.
@@ -442,6 +449,11 @@ thread_local! {
 }
 
 impl BlockingClient {
+    /// Whether this thread is within a call of this client.
+    fn is_calling(&self) -> bool {
+        CALLING.with_borrow(|clients| clients.contains(&std::ptr::from_ref(self).addr()))
+    }
+
     /// Runs `work` without the interpreter. While it waits, handlers of Python signals run; an
     /// exception of a handler ends it, as do `end_call` and `is_over`.
     fn interruptible<T: Send>(
@@ -450,18 +462,18 @@ impl BlockingClient {
         is_over: impl Fn() -> bool + Sync,
         work: impl FnOnce(&mut dyn FnMut() -> bool) -> T + Send,
     ) -> PyResult<T> {
-        let me = std::ptr::from_ref(self).addr();
-        if CALLING.with_borrow(|clients| clients.contains(&me)) {
-            let message =
-                "this client is waiting for a reply: a signal handler or a trace can't use it";
+        if self.is_calling() {
+            let message = "this client is waiting for a reply: a signal handler or a trace \
+                           can't use it, only close it";
             return Err(PyRuntimeError::new_err(message));
         }
         let mut raised = None;
         let ended = self.ended.load(Ordering::Relaxed);
-        CALLING.with_borrow_mut(|clients| clients.push(me));
+        let is_ended = || self.ended.load(Ordering::Relaxed) != ended;
+        CALLING.with_borrow_mut(|clients| clients.push(std::ptr::from_ref(self).addr()));
         let result = py.detach(|| {
             work(&mut || {
-                if self.ended.load(Ordering::Relaxed) != ended || is_over() {
+                if is_ended() || is_over() {
                     return true;
                 }
                 // Before the handlers: nothing that one of them raised is lost.
@@ -473,7 +485,7 @@ impl BlockingClient {
                     };
                     raised = checked.err();
                 }
-                raised.is_some()
+                raised.is_some() || is_ended()
             })
         });
         CALLING.with_borrow_mut(Vec::pop);

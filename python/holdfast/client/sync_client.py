@@ -53,7 +53,10 @@ class SyncClient(SyncOperations):
         self._transport = BlockingConnection(endpoint(self.target), trace)
 
     def close(self) -> None:
-        """Closes the connection after the calls before it. A later call reconnects."""
+        """Closes the connection after the calls before it. A later call reconnects.
+
+        In a signal handler during a call, it ends the calls of all threads with `ConnectionLost`.
+        """
         self._transport.close()
 
     def __enter__(self) -> Self:

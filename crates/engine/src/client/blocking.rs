@@ -36,6 +36,8 @@ pub struct BlockingClient {
     endpoint: Endpoint,
     turns: Turns,
     state: Mutex<State>,
+    /// Whether the call that has the turn closes the connection when it ends.
+    closes: AtomicBool,
     late: AtomicU64,
     /// The longest time of a late reply, in nanoseconds.
     longest_late: AtomicU64,
@@ -112,6 +114,7 @@ impl BlockingClient {
             endpoint,
             turns: Turns::default(),
             state: Mutex::default(),
+            closes: AtomicBool::new(false),
             late: AtomicU64::new(0),
             longest_late: AtomicU64::new(0),
             strays: Arc::default(),
@@ -177,13 +180,28 @@ impl BlockingClient {
     fn call_unless<T>(
         &self,
         mut interrupt: Interrupt<'_>,
+        call: Call<'_>,
+        timeout: Duration,
+        take: impl FnOnce(Response<'_>, &[u8]) -> T,
+    ) -> Option<Result<T, ClientError>> {
+        let _turn = self.turns.take(&mut interrupt)?;
+        let mut state = lock(&self.state);
+        let called = self.call_in_turn(&mut state, &mut interrupt, call, timeout, take);
+        if self.closes.swap(false, Ordering::Relaxed) {
+            state.end();
+        }
+        called
+    }
+
+    fn call_in_turn<T>(
+        &self,
+        state: &mut State,
+        interrupt: &mut Interrupt<'_>,
         mut call: Call<'_>,
         timeout: Duration,
         take: impl FnOnce(Response<'_>, &[u8]) -> T,
     ) -> Option<Result<T, ClientError>> {
-        let (interrupt, conditions) = (&mut interrupt, call.conditions);
-        let _turn = self.turns.take(interrupt)?;
-        let mut state = lock(&self.state);
+        let conditions = call.conditions;
         let mut take = Some(take);
         let mut deadline = Instant::now() + timeout;
         loop {
@@ -194,7 +212,7 @@ impl BlockingClient {
                 return Some(Err(error));
             }
             let peers = &conditions.peers;
-            let open = match self.connected(&mut state, peers, deadline, timeout, interrupt)? {
+            let open = match self.connected(state, peers, deadline, timeout, interrupt)? {
                 Ok(open) if peers.hold(open.peer) => open,
                 Ok(_) => return Some(Err(ClientError::Elsewhere)),
                 Err(error) => return Some(Err(error)),
@@ -342,6 +360,11 @@ impl BlockingClient {
     pub fn close(&self, interrupted: Option<&mut dyn FnMut() -> bool>) {
         let Some(_turn) = self.turns.take(&mut Interrupt::new(interrupted)) else { return };
         lock(&self.state).end();
+    }
+
+    /// Lets the call that has the turn close the connection when it ends, without a wait for that.
+    pub fn close_after_call(&self) {
+        self.closes.store(true, Ordering::Relaxed);
     }
 
     /// Closes an idle connection whose device is gone.
