@@ -36,6 +36,18 @@ for _ in range(100):
 """
 
 
+NO_THREAD = """
+import threading, holdfast
+def start(self):
+    raise RuntimeError("can't start new thread")
+threading.Thread.start = start
+try:
+    holdfast.Memory(coils=1).on_write(print)
+except RuntimeError as error:
+    print(error)
+"""
+
+
 class Calls:
     """A callback that keeps its calls."""
 
@@ -241,6 +253,12 @@ def test_a_program_ends_with_a_callback_that_waits() -> None:
         [sys.executable, "-c", code], check=False, capture_output=True, timeout=wire.DEADLINE * 3
     )
     assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_without_a_thread_nothing_is_left_for_the_end_of_the_program() -> None:
+    command = [sys.executable, "-c", NO_THREAD]
+    done = subprocess.run(command, check=False, capture_output=True, timeout=wire.DEADLINE * 3)
+    assert (done.stdout, done.stderr) == (b"can't start new thread\n", b"")
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="requires fork")

@@ -35,7 +35,12 @@ class WriteCallback:
         self._thread = threading.Thread(target=self._run, name="holdfast-on-write", daemon=True)
         # A thread that waits in native code must have ended before the interpreter does.
         atexit.register(self.close)
-        self._thread.start()
+        try:
+            self._thread.start()
+        except RuntimeError:  # The system has no more threads.
+            atexit.unregister(self.close)
+            queue.close()
+            raise
 
     @property
     def dropped(self) -> int:
