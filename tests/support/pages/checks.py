@@ -111,7 +111,7 @@ def set_replies(block: Block, stage: Stage) -> None:
 
 def sql(block: Block, stage: Stage) -> None:
     """The query of a `sqlite3` command finds rows in the database of the stage."""
-    found = re.fullmatch(r'sqlite3 (\S+) "(.*)"\n', block.text)
+    found = re.fullmatch(r'sqlite3 -cmd "[^"]*" (\S+) "(.*)"\n', block.text)
     assert found
     database = sqlite3.connect(stage.folder / found[1])
 
