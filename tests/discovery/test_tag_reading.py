@@ -255,3 +255,19 @@ def test_a_scale_that_is_refused_costs_its_value() -> None:
     with FakeDevice(without(12)) as device:
         found = read(device, TagReader([tag("power", 10, scale=scale), tag("other", 11)]))
         assert [str(found[0])[:12], found[1]] == ["exception 02", 7]
+
+
+def test_a_number_beside_a_long_text_is_from_one_request() -> None:
+    counter = itertools.cycle([[0, 0xFFFF], [1, 0]])
+
+    def moving(pdu: bytes) -> bytes:
+        """A device whose counters go from 65535 to 65536 and back between all requests."""
+        first, count = struct.unpack(">HH", pdu[1:])
+        halves = next(counter)
+        content = [halves[each % 2] for each in range(first, first + count)]
+        return bytes([3, 2 * count]) + struct.pack(f">{count}H", *content)
+
+    for others in ([tag("text", 0, "string:500")], [tag("texts", 0, "bytes:250[2]")], []):
+        with FakeDevice(moving) as device:
+            found = read(device, TagReader([tag("counters", 0, "uint32[125]"), *others]))
+        assert set(found[0]) == {65535, 65536}

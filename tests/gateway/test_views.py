@@ -173,6 +173,13 @@ digits,hr,6,bcd16
         assert "digit" in found["errors"]["2"]
 
 
+def test_a_number_of_a_long_array_is_from_one_request(gateway: Running) -> None:
+    tags = "name,area,address,type\ncounters,hr,0,uint32[63]\n"
+    with FakeDevice(lambda pdu: registers(pdu, 5)) as device:
+        view(gateway, device.port, {"tags": tags, "format": "csv"}, once=True).next("view")
+        assert [int.from_bytes(pdu[3:]) for pdu in device.asked] == [124, 2]
+
+
 def test_a_scale_in_a_register_is_shown_and_not_written(
     gateway: Running, server: holdfast.Server, memory: holdfast.Memory
 ) -> None:

@@ -43,7 +43,7 @@ ILLEGAL = (ILLEGAL_ADDRESS, ILLEGAL_VALUE)
 Error: TypeAlias = ModbusError | ConversionError
 Result = TypeVar("Result")
 Steps: TypeAlias = "Generator[_Block, bytes, Result]"
-Fetch: TypeAlias = "Callable[[Area, int, int], Awaitable[bytes]]"
+Fetch: TypeAlias = "Callable[[Area, int, str], Awaitable[list[Any]]]"
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class _Block:
     count: int
     fields: list[_Field]
     decode: Decoder
-    element_bytes: int
-    """Of registers, the bytes to read in one request: the block, or an element of a long array."""
+    kind: str
+    """The type to read it as: an array, whose elements are each from one request."""
     requested_in: int = 0
     """The number of the last reading that requested it; 0 is none."""
     answered: bool = True
@@ -137,17 +137,19 @@ class TagReader:
 
         def answer(block: _Block) -> bytes:
             try:
-                return _fetch(client, block)
+                return _joined(block, client.read(block.area, block.address, block.kind))
             finally:
                 between()
 
         return carry_out(self._steps(), answer)
 
     async def read_with(self, fetch: Fetch) -> list[Reading]:
-        """As `read`, but `fetch` returns the bytes of area, address and count, as in a reply."""
-        return await carry_out_async(
-            self._steps(), lambda block: fetch(block.area, block.address, block.count)
-        )
+        """As `read`, but `fetch` returns what a client reads of area, address and type."""
+
+        async def answer(block: _Block) -> bytes:
+            return _joined(block, await fetch(block.area, block.address, block.kind))
+
+        return await carry_out_async(self._steps(), answer)
 
     def _steps(self) -> Steps[list[Reading]]:
         """Reads all tags: yields what to request, and takes the bytes of the reply."""
@@ -208,10 +210,7 @@ class TagReader:
         count = max(each.address + each.count for each in found) - address
         tags = [self.tags[index] for each in found for index in each.tags]
         area, decode = found[0].area, decoder(tags, address, count)
-        # A block that exceeds one request is one range, with arrays of its whole length.
-        is_long = count > READ_LIMITS[area]
-        element_bytes = math.lcm(*(tag.of_type.width for tag in tags)) if is_long else 2 * count
-        return _Block(area, address, count, found, decode, element_bytes)
+        return _Block(area, address, count, found, decode, _kind(area, count, tags))
 
     def _request(self, block: _Block) -> Steps[tuple[list[_Block], ModbusError | None]]:
         """Reads a block. Returns the blocks that replace it, and the error of a silent device."""
@@ -257,14 +256,23 @@ class TagReader:
                 self._readings[index] = Reading(self.tags[index], error=error)
 
 
-def _fetch(client: SyncClient, block: _Block) -> bytes:
+def _kind(area: Area, count: int, tags: Sequence[Tag]) -> str:
+    """The type to read a block as: numbers of its tags are each from one request."""
+    if area in BIT_AREAS:
+        return f"bool[{count}]"
+    size, most = 2 * count, 2 * READ_LIMITS[area]
+    if size > most:
+        # The block is one range, with arrays of its whole length.
+        size = math.lcm(*(tag.of_type.width for tag in tags))
+    if size > most:
+        # Texts do not fit into a request together, and are cut.
+        size = math.lcm(2, *(tag.of_type.width for tag in tags if tag.of_type.is_number))
+    return f"bytes:{size}[{2 * count // size}]"
+
+
+def _joined(block: _Block, read: list[Any]) -> bytes:
     """The bytes of a block, as in a Modbus reply."""
-    area, address, count = block.area, block.address, block.count
-    if area not in BIT_AREAS:
-        kind = f"bytes:{block.element_bytes}[{2 * count // block.element_bytes}]"
-        return b"".join(client.read(area, address, kind))
-    read_bits = client.read_coils if area == "coils" else client.read_discrete_inputs
-    return packed(read_bits(address, count))
+    return packed(read) if block.area in BIT_AREAS else b"".join(read)
 
 
 def _is_silence(error: ModbusError) -> bool:

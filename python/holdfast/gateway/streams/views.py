@@ -19,14 +19,11 @@ from holdfast.gateway.streams.watch import interval_field
 from holdfast.net.http.fields import Field, filled, malformed, object_with
 from holdfast.net.http.requests import BadRequest, shown
 from holdfast.net.http.schemas import BOOLEAN, Schema, array
-from holdfast.tags.decoding import packed
 from holdfast.tags.text import plain, text_of
-from holdfast.types import BIT_AREAS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from holdfast.client import Client
     from holdfast.client.tag_reading import Reading
     from holdfast.gateway.device import RequestedDevice
     from holdfast.gateway.endpoint import Given
@@ -101,8 +98,8 @@ class _TagsPart:
         return {"kind": "tags"}
 
     async def read(self, device: RequestedDevice) -> _State:
-        def fetch(area: Area, address: int, count: int) -> Any:
-            return device.attempt(lambda client: _fetched(client, area, address, count))
+        def fetch(area: Area, address: int, kind: str) -> Any:
+            return device.attempt(lambda client: client.read(area, address, kind))
 
         readings = await self._reader.read_with(fetch)
         silence = readings[0].error
@@ -116,15 +113,6 @@ class _TagsPart:
 
 
 _Part: TypeAlias = _RangePart | _TagsPart
-
-
-async def _fetched(client: Client, area: Area, address: int, count: int) -> bytes:
-    """The bytes of a block, as in a Modbus reply."""
-    if area not in BIT_AREAS:
-        registers: bytes = await client.read(area, address, f"bytes:{2 * count}")
-        return registers
-    read = client.read_coils if area == "coils" else client.read_discrete_inputs
-    return packed(await read(address, count))
 
 
 def _is_answer(reading: Reading) -> bool:
