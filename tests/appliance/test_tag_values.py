@@ -473,6 +473,19 @@ def test_a_poll_of_other_ranges_is_none_of_a_device(tmp_path: Path) -> None:
     assert ("holding_registers", 5, 1) in now.reader.fields
 
 
+def test_another_order_of_the_tags_of_a_register_is_no_change(tmp_path: Path) -> None:
+    made = settings(502)
+    bits = {
+        name: {"area": "holding_registers", "address": 5, "type": f"bit:{bit}"}
+        for bit, name in enumerate(("run", "trip"))
+    }
+    found = TagValues(cast("Any", Polls()))
+    made["devices"]["m"]["tags"] = bits
+    before = adopt(found, load(saved(tmp_path, made)))
+    made["devices"]["m"]["tags"] = dict(reversed(bits.items()))
+    assert adopt(found, load(saved(tmp_path, made))) == before
+
+
 @pytest.mark.parametrize("is_moved", [False, True])
 def test_after_a_reload_a_device_is_read_at_once(
     tmp_path: Path, device: int, serve: Serve, is_moved: bool

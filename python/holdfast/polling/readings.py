@@ -104,7 +104,9 @@ class Reader:
         self.tags = tuple(tags)
         self.named = {tag.name: tag for tag in self.tags}
         """The tags, by name."""
-        self._parts = {tag.name: tag.parts(max_registers, max_bits) for tag in self.tags}
+        each = ((tag.name, tag.parts(max_registers, max_bits)) for tag in self.tags)
+        self.cut = {name: parts for name, parts in each if len(parts) > 1}
+        """The parts of the tags that exceed a request, by name."""
         self._places = Places(self.tags)
         self._blocks: dict[tuple[Area, int, int], tuple[Sequence[Tag], Decoder | None]] = {}
 
@@ -113,7 +115,7 @@ class Reader:
         """What has to be read: areas, addresses and counts, each with the names of its tags."""
         found: dict[tuple[Area, int, int], list[str]] = {}
         for tag in self.tags:
-            for part in self._parts[tag.name]:
+            for part in self.cut.get(tag.name) or (tag.span,):
                 found.setdefault((tag.area, part.start, len(part)), []).append(tag.name)
         return found
 
@@ -146,7 +148,7 @@ class Reader:
                 continue
             pieces = [block for block in blocks if block[0] == tag.area and _overlap(tag, block)]
             read = [(piece[1], piece[2], piece[3]) for piece in pieces if piece[3] is not None]
-            data = assembled(tag, self._parts[tag.name], read)
+            data = assembled(tag, self.cut.get(tag.name) or [tag.span], read)
             faulty = [block for block in [*pieces, *blocks[-1:]] if block[4]]
             if data is not None:
                 yield tag.name, self._reading(tag, value_of(tag, data, tag.address), pieces[-1][5])

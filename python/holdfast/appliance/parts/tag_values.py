@@ -89,10 +89,10 @@ class TaggedDevice(NamedTuple):
 
     @property
     def contents(self) -> tuple[object, object, Mapping[str, object]]:
-        """What is read: the source, the ranges, and the place and meaning of each tag."""
+        """What is read: the source, the parts of long tags, each tag's place and meaning."""
         tags = self.reader.named.items()
         meanings = {name: tag.place_and_meaning for name, tag in tags}
-        return self.source, self.reader.fields, meanings
+        return self.source, self.reader.cut, meanings
 
 
 def _identities(tagged: Mapping[str, TaggedDevice]) -> set[tuple[str, str]]:
