@@ -191,6 +191,15 @@ def test_a_request_must_be_able_to_read_a_number(tmp_path: Path) -> None:
     )
 
 
+def test_all_tags_are_checked_if_max_registers_is_invalid(tmp_path: Path) -> None:
+    forbidden = "forbidden: [{area: coils, start: 3, end: 9}]"
+    tags = "{a: {area: coils, address: 3}, b: {area: coils, address: 4}}"
+    device = f"{{url: tcp://10.0.0.5, interval: 1, max_registers: 0, {forbidden}, tags: {tags}}}"
+    found = problems(written(tmp_path, f"devices:\n  a: {device}\n"))
+    keys = ["max_registers", "tags.a.address", "tags.b.address"]
+    assert [each.split(": ")[1] for each in found] == [f"devices.a.{key}" for key in keys]
+
+
 def test_a_device_cannot_move_a_scale_out_of_reach(tmp_path: Path) -> None:
     own = "tags: {sf: {area: holding_registers, address: 1}}"
     device = f"{{url: tcp://10.0.0.5, profile: meter, interval: 1, {own}}}"

@@ -26,6 +26,9 @@ FIXED = {
 }
 """Types without a parameter, and how many bytes an element has in registers."""
 
+LONGEST_NUMBER = max(FIXED.values()) // 2
+"""The registers of the longest number."""
+
 ALLOWED = f"bit:0 to bit:15, {', '.join(FIXED)}, string:N, bytes:N, and arrays: float32[10]"
 MAX_REGISTERS = ADDRESSES
 

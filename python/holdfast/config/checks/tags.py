@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING
 
 from holdfast.config.checks.common import Scope, check_name, items, until_invalid
 from holdfast.config.models.base import InvalidValue
+from holdfast.protocol import READ_REGISTERS
 from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import extent
 from holdfast.tags import Tag, TagError
 from holdfast.tags.scale import RegisterScale
 from holdfast.values.orders import DEFAULT_ORDER
+from holdfast.values.types import LONGEST_NUMBER
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -54,8 +56,11 @@ def _check_device(
     if device.tags:
         own = _tags(scope, path, device.tags, order)
         tags = _resolved(scope, path, device.tags, own, tags)
+    most = READ_REGISTERS
+    with until_invalid():
+        most = device.max_registers
     for tag in tags.values():
-        for key, flaw in _flaws(tag, device):
+        for key, flaw in _flaws(tag, device, most):
             if tag.name in device.tags:
                 scope.report.add((*path, "tags", tag.name, key), flaw)
             else:
@@ -106,24 +111,26 @@ def _resolved(
     return found
 
 
-def _flaws(tag: Tag, device: DeviceConfig) -> Iterator[tuple[str, str]]:
-    """Why no request to the device can read a value, or not with its scale; and the tag's key."""
+def _flaws(tag: Tag, device: DeviceConfig, most: int) -> Iterator[tuple[str, str]]:
+    """Why no request to the device, of `most` registers, can read a value, or not with its scale;
+    and the tag's key.
+    """
     span, source = tag.span, tag.source
     if source is None:
         if (overlapped := next(_overlapped(tag, device), None)) is not None:
             place = str(tag.address) if len(span) == 1 else extent(span)
             message = f"found {place}, which overlaps {overlapped}, allowed: other addresses"
             yield "address", message
-        number, most = tag.of_type.width // 2, device.max_registers
-        if tag.of_type.is_number and number > most:
-            found = f"a number of {tag.type} has {number} registers, max_registers is {most}"
-            yield "type", f"{found}, and all of them must be from one request"
+        if most < LONGEST_NUMBER and tag.of_type.is_number:
+            number = tag.of_type.width // 2
+            if number > most:
+                found = f"a number of {tag.type} has {number} registers, max_registers is {most}"
+                yield "type", f"{found}, and all of them must be from one request"
         return
     assert isinstance(tag.scale, RegisterScale), "others have no source"
     where, both = tag.scale.where, "and a value is only read together with its scale"
     found = f"the scale is from {where}, {extent(span)}"
-    if len(span) > device.max_registers:
-        most = device.max_registers
+    if len(span) > most:
         yield "scale", f"{found} are {len(span)} registers, max_registers is {most}, {both}"
     for overlapped in _overlapped(tag, device):
         yield "scale", f"{found} overlaps {overlapped}, {both}"
