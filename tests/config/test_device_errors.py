@@ -455,6 +455,16 @@ devices:
     assert [each.partition("interval: ")[2] for each in found] == ([message] if pauses else [])
 
 
+def test_pauses_are_between_the_requests_for_whole_numbers(folder: Folder) -> None:
+    text = """
+devices:
+  meter: {url: tcp://a, interval: 1, tolerance: {pause: 0.2}, max_registers: 3, tags: {
+    a: {area: holding_registers, address: 0, type: "uint32[6]"}}}
+"""
+    [warning] = folder.warnings(text)
+    assert "the pauses of 6 requests take 1.2 s" in warning
+
+
 @pytest.mark.parametrize("pause", ["0.1, max_registers: 1", "0.6, max_gap: auto"])
 def test_pauses_that_may_be_short_enough_are_no_warning(folder: Folder, pause: str) -> None:
     text = """
