@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import given
@@ -11,6 +11,9 @@ from hypothesis import strategies as st
 
 from holdfast.tags import Tag
 from holdfast.tags.decoding import Places, Undecoded, assembled, decoder, value_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 
 def register(name: str, address: int, kind: str = "uint16", **more: Any) -> Tag:
@@ -116,6 +119,23 @@ def test_a_tag_is_assembled_from_whole_parts(
     tag, parts = register("a", 10, "uint16[3]"), [range(10, 12), range(12, 13)]
     counted = [(address, len(read) // 2, read) for address, read in pieces]
     assert assembled(tag, parts, counted) == data
+
+
+def test_the_pieces_of_a_long_tag_are_looked_at_once_or_twice() -> None:
+    looks = []
+
+    class Piece(tuple[int, int, bytes]):
+        __slots__ = ()
+
+        def __iter__(self) -> Iterator[Any]:
+            looks.append(self)
+            return super().__iter__()
+
+    tag = register("a", 10, "uint16[300]")
+    pieces = [Piece((10 + at, 1, registers(at))) for at in range(300)]
+    parts = tag.parts(1, 2000)
+    assert assembled(tag, parts, pieces[100:] + pieces[:100]) == registers(*range(300))
+    assert len(looks) < 3 * len(pieces)
 
 
 def test_a_bit_that_is_off_is_not_one_that_is_missing() -> None:

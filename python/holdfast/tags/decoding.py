@@ -141,21 +141,24 @@ def assembled(
     `pieces` are addresses, counts and bytes. Each of the `parts` of the tag is from one of them.
     """
     bits: list[bool] = []
-    registers = b""
+    registers = bytearray()
+    # Both are in the order of addresses, though pieces may begin in the middle: the piece of a part
+    # is that of the part before, or the next one.
+    at = 0
     for part in parts:
-        whole = (
-            (part.start - address, part.stop - address, data)
-            for address, count, data in pieces
-            if address <= part.start and part.stop <= address + count
-        )
-        if (found := next(whole, None)) is None:
+        for _ in pieces:
+            address, count, data = pieces[at]
+            first, last = part.start - address, part.stop - address
+            if first >= 0 and last <= count:
+                break
+            at = (at + 1) % len(pieces)
+        else:
             return None
-        first, last, data = found
         if tag.of_bits:
             bits += _unpacked(data)[first:last]
         else:
             registers += data[2 * first : 2 * last]
-    return packed(bits) if tag.of_bits else registers
+    return packed(bits) if tag.of_bits else bytes(registers)
 
 
 def packed(bits: Sequence[bool]) -> bytes:
