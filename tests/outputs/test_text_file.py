@@ -328,6 +328,22 @@ def test_a_database_can_be_read_while_it_is_open(tmp_path: Path) -> None:
     database.close()
 
 
+def test_a_write_ahead_log_that_another_program_has_open_is_written(tmp_path: Path) -> None:
+    file = tmp_path / "a.db"
+    database = SqliteFile(settings(file, "sqlite"))
+    with closing(sqlite3.connect(file)) as other:
+        other.execute("PRAGMA journal_mode=WAL")
+        other.execute("CREATE TABLE t (x)")
+        database.send(READINGS[:1])
+        assert other.execute("SELECT tag FROM readings").fetchall() == [("t",)]
+    database.close()
+    database.send(READINGS[1:2])
+    database.close()
+    with closing(sqlite3.connect(file)) as again:
+        assert again.execute("PRAGMA journal_mode").fetchone() != ("wal",)
+        assert again.execute("SELECT count(*) FROM readings").fetchone() == (2,)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no open database")
 @pytest.mark.parametrize("removed", ["a.db", "a.db*"])
 def test_a_database_that_is_removed_is_made_again(tmp_path: Path, removed: str) -> None:

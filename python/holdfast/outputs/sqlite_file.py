@@ -69,7 +69,13 @@ class SqliteFile(Receiver):
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
             # A write-ahead log would have a file in shared memory, for which SQLite takes no room
             # on the disk: if that is full, the process ends at a page of it, by SIGBUS.
-            self._db.execute("PRAGMA journal_mode=TRUNCATE")
+            # Another program that has an older database open keeps the log there: the next opening
+            # tries again.
+            try:
+                self._db.execute("PRAGMA journal_mode=TRUNCATE")
+            except sqlite3.OperationalError as error:
+                if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
+                    raise
             self._db.executescript(_CREATE)
             self._status = self._file.stat()
         return self._db
