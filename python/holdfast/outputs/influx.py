@@ -11,9 +11,11 @@ import re
 import socket
 import ssl
 import threading
+import time
 from typing import TYPE_CHECKING
 from urllib.parse import urlencode
 
+from holdfast.client.tcp_connect import connected_sync, remaining_s
 from holdfast.net.addresses import joined
 from holdfast.net.secret_file import read_secret
 from holdfast.net.tls import NO_FILES, https_context
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from holdfast.polling import Reading
 
 CONNECT_TIMEOUT_S = 3.0
-"""Seconds to connect, at most."""
+"""Seconds to look up the name and connect, at most."""
 
 MAX_RESPONSE_BYTES = 65_536
 """The bytes of an answer that are read."""
@@ -195,13 +197,25 @@ class Influx(Receiver):
     def _connected(self) -> http.client.HTTPConnection:
         """The connection; a new one if there is none."""
         if self._connection is None:
-            if not (left := time_left(self._stop)):
-                raise OSError("stopped")
-            connection = self._created(min(CONNECT_TIMEOUT_S, self._settings.timeout, left))
-            connection.connect()
-            connection.sock.settimeout(self._settings.timeout)
-            self._connection = connection
+            self._check_stop()
+            seconds = min(CONNECT_TIMEOUT_S, self._settings.timeout, time_left(self._stop))
+            try:
+                self._connection = self._opened(time.monotonic() + seconds)
+            except TimeoutError as error:
+                message = f"no connection to {self._at} within {seconds:.1f} s"
+                raise TimeoutError(message) from error
+            self._connection.sock.settimeout(self._settings.timeout)
+            try:
+                self._check_stop()  # Before, `_interrupt` had nothing to end.
+            except OSError:
+                self.close()
+                raise
         return self._connection
+
+    def _check_stop(self) -> None:
+        """Raises `OSError` if the time after a stop is over."""
+        if not time_left(self._stop):
+            raise OSError("stopped")
 
     def _is_over(self, connection: socket.socket) -> bool:
         """Whether the receiver has closed a connection, or sends what nobody has asked for."""
@@ -216,12 +230,26 @@ class Influx(Receiver):
             connection.settimeout(self._settings.timeout)
         return True
 
-    def _created(self, timeout: float) -> http.client.HTTPConnection:
+    def _opened(self, deadline: float) -> http.client.HTTPConnection:
+        """A connection. `http.client` would wait for a name server as long as the system does, and
+        for each address anew.
+        """
         host, port, secure, _ = self._target
         if not secure:
-            return http.client.HTTPConnection(host, port, timeout=timeout)
+            plain = http.client.HTTPConnection(host, port)
+            plain.sock = connected_sync(host, port, deadline)
+            return plain
         tls = NO_FILES if self._settings.tls is None else self._settings.tls.files
-        return http.client.HTTPSConnection(host, port, timeout=timeout, context=https_context(tls))
+        context = https_context(tls)
+        connection = http.client.HTTPSConnection(host, port, context=context)
+        sock = connected_sync(host, port, deadline)
+        try:
+            sock.settimeout(remaining_s(deadline))
+            connection.sock = context.wrap_socket(sock, server_hostname=connection.host)
+        except BaseException:
+            sock.close()
+            raise
+        return connection
 
     def _authorization(self) -> dict[str, str]:
         """The credentials, read each time, so that a new token needs no restart."""
