@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from holdfast.config.models.outputs import FileConfig
-from holdfast.outputs import text_file
+from holdfast.outputs import sender, text_file
 from holdfast.outputs.sqlite_file import SqliteFile
 from holdfast.outputs.text_file import HEAD, TextFile
+from holdfast.runtime.stop import Stop
 from support.line_protocol import parsed
 from support.readings import numbered, reading, tag
 from support.renaming import not_renamed
@@ -342,6 +343,22 @@ def test_a_write_ahead_log_that_another_program_has_open_is_written(tmp_path: Pa
     with closing(sqlite3.connect(file)) as again:
         assert again.execute("PRAGMA journal_mode").fetchone() != ("wal",)
         assert again.execute("SELECT count(*) FROM readings").fetchone() == (2,)
+
+
+def test_a_database_that_another_program_has_locked_does_not_hold_up_a_stop(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database, stop = SqliteFile(settings(tmp_path / "a.db", "sqlite")), Stop()
+    database.use_stop(stop)
+    waits = []
+    for _ in range(2):
+        database.send(READINGS)
+        assert database._db is not None
+        waits += database._db.execute("PRAGMA busy_timeout").fetchone()
+        stop.set()
+        monkeypatch.setattr(sender, "STOP_TIMEOUT_S", 0.0)
+    database.close()
+    assert waits == [2000, 0]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows removes no open database")

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast.outputs.buffer_file import file_errors, is_in_place
-from holdfast.outputs.sender import STOP_TIMEOUT_S, Receiver
+from holdfast.outputs.sender import STOP_TIMEOUT_S, Receiver, time_left
 from holdfast.outputs.text_file import row
+from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
     import os
@@ -37,6 +38,11 @@ class SqliteFile(Receiver):
         self._db: sqlite3.Connection | None = None
         self._status: os.stat_result | None = None
         """Of the file that is open."""
+        self._stop = Stop()
+
+    def use_stop(self, stop: Stop) -> None:
+        """Limits the waits for other programs after the stop. Called before all else."""
+        self._stop = stop
 
     def send(self, readings: list[Reading]) -> None:
         """Inserts rows. They survive a power cut when this returns."""
@@ -65,7 +71,8 @@ class SqliteFile(Receiver):
         if self._status is None or not is_in_place(self._file, self._status):
             self.close()
         if self._db is None:
-            self._db = sqlite3.connect(self._file, timeout=STOP_TIMEOUT_S, check_same_thread=False)
+            self._db = sqlite3.connect(self._file, check_same_thread=False)
+            self._limit_waits(self._db)
             self._db.execute("PRAGMA auto_vacuum=INCREMENTAL")
             # A write-ahead log would have a file in shared memory, for which SQLite takes no room
             # on the disk: if that is full, the process ends at a page of it, by SIGBUS.
@@ -78,7 +85,12 @@ class SqliteFile(Receiver):
                     raise
             self._db.executescript(_CREATE)
             self._status = self._file.stat()
+        self._limit_waits(self._db)
         return self._db
+
+    def _limit_waits(self, db: sqlite3.Connection) -> None:
+        seconds = min(STOP_TIMEOUT_S, time_left(self._stop))
+        db.execute(f"PRAGMA busy_timeout={int(seconds * 1000)}")
 
     def _shrink(self, db: sqlite3.Connection) -> None:
         """Removes the oldest rows if there are too many."""
