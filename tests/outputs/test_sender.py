@@ -274,17 +274,45 @@ def test_what_is_left_at_the_end_is_sent() -> None:
     assert output.receiver.closed == 1
 
 
-def test_what_waits_after_an_outage_is_sent_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("has_file", "is_followed", "sent"), [(False, False, 1500), (False, True, 0), (True, False, 0)]
+)
+def test_what_would_be_lost_after_an_outage_is_sent_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_file: bool, is_followed: bool, sent: int
+) -> None:
     """The receiver works again, and the next attempt would come after the stop."""
     for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S"):
         monkeypatch.setattr(module, name, 3600.0)
-    output = Running()
+    output = Running(tmp_path / "b.db" if has_file else None)
+    output.sender._is_followed = lambda: is_followed
     output.receiver.error = OSError("down")
     output.buffer.offer(polls(1500))
     wire.until(lambda: output.sender.status()["connected"] is False, "it has failed")
     output.receiver.error = None
     output.end()
-    assert output.receiver.sent == list(range(1500))
+    assert output.receiver.sent == list(range(sent))
+
+
+def test_what_a_full_disk_does_not_take_after_an_outage_is_sent_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """That the disk is full shows only at the stop."""
+    for name in ("FIRST_PAUSE_S", "MAX_PAUSE_S", "CHECK_INTERVAL_S"):
+        monkeypatch.setattr(module, name, 3600.0)
+    output = Running(tmp_path / "b.db")
+    output.receiver.error = OSError("down")
+    output.buffer.offer(polls(1500))
+    wire.until(lambda: getattr(output.buffer.stored, "count", 0) == 1500, "it is stored")
+    output.receiver.error = None
+
+    def full(*_: object) -> int:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(BufferFile, "add", full)
+    output.buffer.offer(polls(10, 1500))
+    output.end()
+    assert output.receiver.sent == list(range(1510))
+    assert count(caplog, "output_unsent") == 0
 
 
 def test_what_can_not_be_sent_at_the_end_is_in_the_file(

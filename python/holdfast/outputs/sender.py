@@ -289,6 +289,8 @@ class OutputSender:
 
         After an outage, the receiver may work again: what would be lost is tried once more.
         """
+        if self._is_failing:
+            self._move_to_file(CHECK_INTERVAL_S)  # Only this shows whether the file takes it.
         has_file = self._buffer.stored is not None and self._file_error is None
         if not (self._is_failing and (has_file or self._is_followed())):
             while len(self._buffer) and time.monotonic() < end:
