@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
+import socket
 import threading
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -213,3 +215,24 @@ def test_a_frozen_server_does_not_hold_up_a_stop(
     own_nats.thaw()
     assert not thread.is_alive()
     assert len(buffer) == 1
+
+
+def test_connecting_does_not_hold_up_a_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "STOP_TIMEOUT_S", 0.05)
+    waits: list[float] = []
+    wait_for = asyncio.wait_for
+
+    async def noted(task: Any, timeout: float) -> Any:
+        waits.append(timeout)
+        return await wait_for(task, timeout)
+
+    monkeypatch.setattr(asyncio, "wait_for", noted)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        url = f"nats://127.0.0.1:{silent.getsockname()[1]}"
+        output, stop = NatsOutput(Servers((url,)), "modbus", "tentacle"), Stop()
+        output.use_stop(stop)
+        stop.set()
+        with pytest.raises(OSError):  # noqa: PT011
+            output.send(numbered(1))
+        output.close()
+    assert waits[0] <= 0.05
