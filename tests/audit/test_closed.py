@@ -336,6 +336,25 @@ def test_a_file_that_is_full_does_not_seem_to_work_before_it_does(
     assert verify([log]).lost == 0
 
 
+@pytest.mark.parametrize("fail_closed", [False, True])
+def test_what_can_not_be_written_until_the_end_is_logged(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    fail_closed: bool,
+) -> None:
+    audit = Audit(tmp_path / "a", max_bytes=10_000, keep=1, fail_closed=fail_closed)
+    make_room = full(monkeypatch, room=0)
+    for number in range(3):
+        audit.write(number=number)
+    audit.close()
+    make_room()
+    audit.close()
+    failed, lost = caplog.records
+    assert (failed.message, lost.message) == ("audit_failed", "audit_lost")
+    assert vars(lost)["fields"] == {"count": 3}
+
+
 def test_a_file_that_can_not_be_opened_is_named_with_its_setting(run: Run, tmp_path: Path) -> None:
     file = tmp_path / "audit.log"
     audit = Audit(file, max_bytes=65536, keep=1)

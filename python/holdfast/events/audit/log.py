@@ -192,11 +192,15 @@ class Audit:
             }
 
     def close(self) -> None:
-        """Writes what waits, and closes file and copies. Later lines are lost."""
+        """Writes what waits, and closes file and copies. What the file still lacks is logged. Later
+        lines are lost.
+        """
         with self._lock:
             if self._waiting or self._lost_unreported:
                 self._store([])
             self._lose(self._waiting)
+            if self._lost_unreported and not self._is_closed:
+                log_lines.write(logging.ERROR, "audit_lost", count=self._lost_unreported)
             self._waiting, self._is_closed = [], True
             if self._file is not None:
                 self._file.close()
