@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +36,7 @@ from support.fake_device import FakeDevice, exception, registers
 from support.fleet_nodes import FLEET, prepare
 from support.judges import Judges
 from support.leases import BRIEF, ENDLESS
-from support.nats_bus import Caller, logged
+from support.nats_bus import Caller, logged, refuse_updates
 from support.scanner_parts import (
     allowed_of,
     broker_of,
@@ -605,14 +606,59 @@ def test_deletions_end_in_a_bucket_that_was_made_without_ttls(
     assert (found.headers or {})["Nats-TTL"] == "3600s"
 
 
-def test_a_bucket_that_loses_subscriptions_is_refused(
-    node: Callable[..., Running], caller: Caller, caplog: pytest.LogCaptureFixture
+def test_a_ttl_of_the_bucket_is_removed_and_no_other_setting(
+    node: Callable[..., Running], caller: Caller, judges: Judges
 ) -> None:
-    caller.do(caller.client.jetstream().create_key_value(bucket=WANTS, ttl=3600))
-    running = node("a", wait=False)
-    wire.until(lambda: logged(caplog, "fleet_unavailable"), "it is logged")
-    assert "TTL of 3600 s" in logged(caplog, "fleet_unavailable")[0]["reason"]
-    assert not member_of(running.scanner).is_joined
+    config = StreamConfig(
+        f"KV_{WANTS}",
+        subjects=[f"$KV.{WANTS}.>"],
+        max_msgs_per_subject=1,
+        max_age=3600.0,
+        max_bytes=10**8,
+        duplicate_window=60.0,
+        description="of the plant",
+    )
+    made = caller.do(caller.client.jetstream().add_stream(config)).config
+    share(node("a", check_interval_s=0.1))
+    subscribe_all(caller, judges)
+
+    def found() -> StreamConfig:
+        config = caller.do(caller.client.jetstream().stream_info(f"KV_{WANTS}")).config
+        return replace(config, metadata=None)  # It has the versions of the server.
+
+    settings = replace(made, max_age=0.0, allow_msg_ttl=True, metadata=None)
+    assert found() == settings
+    # The same while a node runs.
+    caller.do(caller.client.jetstream().update_stream(replace(settings, max_age=1800.0)))
+    wire.until(lambda: found() == settings, "it is removed again")
+
+
+def test_a_ttl_that_stays_stops_no_fleet(
+    node: Callable[..., Running],
+    caller: Caller,
+    judges: Judges,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    refuse_updates(monkeypatch)
+    caller.do(
+        caller.client.jetstream().add_stream(
+            StreamConfig(
+                f"KV_{WANTS}",
+                subjects=[f"$KV.{WANTS}.>"],
+                max_msgs_per_subject=1,
+                max_age=3600.0,
+                allow_msg_ttl=True,
+            )
+        )
+    )
+    share(node("a", check_interval_s=0.1))
+    subscribe_all(caller, judges)
+    running = node("b")
+    wire.until(lambda: len(devices_of(running)) == len(judges.devices), "it knows what is stored")
+    found = logged(caplog, "subscriptions_not_kept")
+    assert len(found) == 2, "once for each node"
+    assert "TTL of 3600 s, which stays: not today" in found[0]["reason"]
 
 
 def test_many_devices_are_browsed_in_pages(

@@ -8,6 +8,7 @@ import logging
 import shutil
 import threading
 from concurrent.futures import Future
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -26,7 +27,15 @@ from holdfast.scanner.subscriptions.registry import Registry
 from holdfast.scanner.subscriptions.request_rules import Rules, ScannerLimits
 from support import wire
 from support.brokers import NatsServer
-from support.nats_bus import SMALL_PAYLOAD, Caller, leaving, logged, subscription, tag
+from support.nats_bus import (
+    SMALL_PAYLOAD,
+    Caller,
+    leaving,
+    logged,
+    refuse_updates,
+    subscription,
+    tag,
+)
 from support.scanner_parts import store_of
 from support.tentacle import plc_subscribe, plc_tag, plc_unsubscribe
 
@@ -487,13 +496,55 @@ def test_a_bucket_that_is_deleted_is_written_again(
     wire.until(lambda: len(subscriptions(caller)) == 1, "the subscription is there again")
 
 
-def test_a_bucket_that_loses_entries_keeps_nothing(
-    run_scanner: Run, own_nats: NatsServer, own_caller: Caller, caplog: pytest.LogCaptureFixture
+def set_ttl(caller: Caller, seconds: float) -> None:
+    jetstream = caller.client.jetstream()
+    found = caller.do(jetstream.stream_info(f"KV_{BUCKET}")).config
+    changed = replace(found, max_age=seconds, duplicate_window=seconds)
+    caller.do(jetstream.update_stream(changed))
+
+
+def ttl(caller: Caller) -> float | None:
+    return caller.do(caller.client.jetstream().stream_info(f"KV_{BUCKET}")).config.max_age
+
+
+def test_a_ttl_of_the_bucket_is_removed_and_what_it_has_ended_is_stored_again(
+    run_scanner: Run, caller: Caller, server: holdfast.Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own_caller.do(own_caller.client.jetstream().create_key_value(bucket=BUCKET, ttl=3600))
-    run_scanner(own_nats)
+    running = run_scanner()
+    assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
+    set_ttl(caller, 0.1)  # While it runs.
+    wire.until(lambda: not caller.keys(BUCKET), "the server has removed all")
+    monkeypatch.setattr(store, "CHECK_INTERVAL_S", 0.1)
+    assert caller.request("modbus.subscribe", subscription(server, tag("b", 1)))["success"]
+    wire.until(lambda: not ttl(caller), "it is removed")
+    wire.until(lambda: len(caller.kept(BUCKET)) == 2, "both entries are there again")
+    running.stop()
+    set_ttl(caller, 3600)
+    run_scanner()
+    assert [each["id"] for each in device(caller, "plc1")["tags"]] == ["a", "b"]
+    wire.until(lambda: not ttl(caller), "it is removed at the start")
+
+
+def test_a_ttl_that_stays_stops_no_scanner(
+    run_scanner: Run,
+    caller: Caller,
+    server: holdfast.Server,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first = run_scanner()
+    assert caller.request("modbus.subscribe", subscription(server, tag("a", 0)))["success"]
+    first.stop()
+    set_ttl(caller, 3600)
+    refuse_updates(monkeypatch)
+    run_scanner()
+    assert [each["id"] for each in device(caller, "plc1")["tags"]] == ["a"]
     wire.until(lambda: logged(caplog, "subscriptions_not_kept"), "it is logged")
-    assert "TTL of 3600 s" in logged(caplog, "subscriptions_not_kept")[0]["reason"]
+    [found] = logged(caplog, "subscriptions_not_kept")
+    assert "TTL of 3600 s, which stays: not today" in found["reason"]
+    assert caller.request("modbus.subscribe", subscription(server, tag("b", 1)))["success"]
+    [stored] = subscriptions(caller).values()
+    assert [each["id"] for each in stored["tags"]] == ["a", "b"]
 
 
 def test_jetstream_that_fails_holds_no_request_up_and_gets_everything_later(

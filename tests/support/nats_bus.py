@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import pytest
 from nats.aio.client import Client
-from nats.js.errors import NotFoundError
+from nats.js import JetStreamContext
+from nats.js.errors import APIError, NotFoundError
 
 from holdfast.config.values.scanner_settings import parse_pollable
 from holdfast.net.nats.connection import Servers
@@ -357,6 +358,15 @@ def run_scanner(nats: NatsServer) -> Iterator[Run]:
 def scanner(run_scanner: Run) -> Running:
     """A scanner with default settings, connected to `nats`."""
     return run_scanner()
+
+
+def refuse_updates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """From now on, JetStream refuses changes of the settings of streams."""
+
+    async def refuse(*_: Any, **__: Any) -> None:
+        raise APIError(code=500, description="not today")
+
+    monkeypatch.setattr(JetStreamContext, "update_stream", refuse)
 
 
 def logged(caplog: pytest.LogCaptureFixture, event: str) -> list[dict[str, Any]]:

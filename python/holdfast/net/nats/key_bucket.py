@@ -82,14 +82,6 @@ async def create_stream(jetstream: JetStreamContext, config: StreamConfig, repli
             raise
 
 
-def check_keys_stay(stream: StreamConfig) -> None:
-    """Raises `Error` for a bucket whose keys end by themselves: somebody has made it with a TTL."""
-    if stream.max_age:
-        bucket = (stream.name or "").removeprefix("KV_")
-        flaw = f"the bucket {bucket} has a TTL of {stream.max_age:g} s, which removes entries"
-        raise Error(f"{flaw}: nats kv edit {bucket} --ttl=0")
-
-
 class KeyBucket:
     """Keys over one connection. Every change names the revision that it replaces."""
 
@@ -141,10 +133,13 @@ class KeyBucket:
             await create_stream(jetstream, config, replicas)
             return await jetstream.stream_info(self._stream)
 
-    async def allow_ttls(self, config: StreamConfig) -> None:
-        """Lets keys of a bucket with these settings have a TTL. Raises the errors of nats-py."""
+    async def allow_ttls(self, config: StreamConfig) -> StreamConfig:
+        """Lets keys of a bucket with these settings have a TTL. Returns the new settings.
+
+        Raises the errors of nats-py.
+        """
         jetstream = self.client.jetstream(timeout=self._request_timeout_s)
-        await jetstream.update_stream(replace(config, allow_msg_ttl=True))
+        return (await jetstream.update_stream(replace(config, allow_msg_ttl=True))).config
 
     async def publish(self, key: str, value: bytes, revision: int, headers: dict[str, str]) -> int:
         """Replaces the revision of a key, 0 if there is none. Returns the new revision.

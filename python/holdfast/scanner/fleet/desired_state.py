@@ -15,9 +15,10 @@ from nats.errors import Error
 
 from holdfast.config.values.scanner_settings import WANTS
 from holdfast.events import log_lines
-from holdfast.net.nats.key_bucket import OPERATION_HEADER, KeyBucket, Outdated, check_keys_stay
+from holdfast.net.nats.key_bucket import OPERATION_HEADER, KeyBucket, Outdated
 from holdfast.runtime.malformed_json import MALFORMED_JSON, malformed_text
 from holdfast.scanner.fleet.agreement import FleetRefused, Terms
+from holdfast.scanner.jetstream.bucket_ttl import TtlRemoval
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -85,6 +86,7 @@ class DesiredState:
         self._on_change = on_change
         self._on_loss = on_loss
         self._bucket: KeyBucket | None = None
+        self._ttl = TtlRemoval()
         self._values: dict[str, tuple[int, bytes]] = {}
         """Revision and value of each device; the value is empty if it was deleted."""
         self._latest = 0
@@ -112,15 +114,15 @@ class DesiredState:
     ) -> None:
         """Makes the bucket, agrees on the terms, and begins to follow the values.
 
-        Raises `FleetRefused` if other terms are in force, and errors of nats-py, also for a bucket
-        that loses subscriptions.
+        Raises `FleetRefused` if other terms are in force, and errors of nats-py.
         """
         if self._bucket is None or self._bucket.client is not client:
             self._bucket = KeyBucket(client, self.bucket, TIMEOUT_S, TIMEOUT_S)
         found = await self._bucket.make(3, self._latest, allow_msg_ttl=True)
-        check_keys_stay(found.config)
-        if not found.config.allow_msg_ttl:  # Before deletions had an end.
-            await self._bucket.allow_ttls(found.config)
+        config = found.config
+        if not config.allow_msg_ttl:  # Before deletions had an end.
+            config = await self._bucket.allow_ttls(config)
+        await self._ttl.remove(client, config)
         self._identify(str(found.created), found.state.last_seq)
         await self.agree(terms, is_in_force, may_replace=has_joined)
         await self._restore()
@@ -183,13 +185,17 @@ class DesiredState:
         return is_stored and bool(former.value)
 
     async def is_followed(self) -> bool:
-        """Whether changes of the bucket still arrive. Raises errors of nats-py."""
+        """Whether changes of the bucket still arrive. Raises errors of nats-py.
+
+        Removes a TTL that the bucket was given meanwhile.
+        """
         bucket = self._bucket
         if bucket is None or bucket.following is None:
             return False
         info = await bucket.info()
         if str(info.created) != self.made_at or info.state.last_seq < self._latest:
             return False
+        await self._ttl.remove(bucket.client, info.config)
         await bucket.following.consumer_info()  # Its server may have ended.
         return True
 

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 from nats.js.errors import NotFoundError
 
 from holdfast.events import log_lines
-from holdfast.net.nats.key_bucket import check_keys_stay
 from holdfast.net.nats.outbox import USUAL_MAX_PAYLOAD_BYTES
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
@@ -28,6 +27,7 @@ from holdfast.scanner.jetstream.availability import (
     Availability,
     State,
 )
+from holdfast.scanner.jetstream.bucket_ttl import TtlRemoval
 from holdfast.scanner.jetstream.entries import status_keys, subscription_keys
 from holdfast.scanner.jetstream.key_watch import reading
 
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from nats.aio.client import Client
     from nats.js import JetStreamContext
+    from nats.js.api import StreamConfig
     from nats.js.kv import KeyValue
 
     from holdfast.scanner.subscriptions.key import SubscriptionKey
@@ -48,7 +49,7 @@ MAX_CONCURRENT_WRITES = 16
 """Subscriptions that are written at once."""
 
 CHECK_INTERVAL_S = 10.0
-"""Between looks whether the bucket was deleted or replaced, which NATS does not tell."""
+"""Between looks whether the bucket was deleted, replaced or changed, which NATS does not tell."""
 
 
 class EntryStore:
@@ -96,6 +97,9 @@ class EntryStore:
         self._made_at = ""
         """When the bucket was made that was read last."""
         self._checked_at = 0.0
+        self._settings: StreamConfig | None = None
+        """Those of the bucket at the last look."""
+        self._ttl = TtlRemoval()
         self._busy = asyncio.Lock()
         """Held while entries are read or written."""
         self.tried = asyncio.Event()
@@ -161,6 +165,9 @@ class EntryStore:
             self.tried.set()
             if not self._availability.is_available:
                 self._release()
+            elif self._settings is not None and await self._ttl.remove(client, self._settings):
+                bucket = None  # It may have lost entries: they are stored again.
+                self._has_work.set()
 
     async def _wait(self) -> None:
         """Waits for work; while JetStream fails, for the next attempt."""
@@ -182,19 +189,19 @@ class EntryStore:
         if time.monotonic() < self._checked_at + CHECK_INTERVAL_S:
             return True
         found = await client.jetstream(timeout=JETSTREAM_TIMEOUT_S).stream_info(STREAM)
-        self._checked_at = time.monotonic()
+        self._settings, self._checked_at = found.config, time.monotonic()
         return str(found.created) == self._made_at
 
     async def _read(self, client: Client) -> KeyValue:
-        """Opens the bucket and reports its entries. Raises an error if it would lose them."""
+        """Opens the bucket and reports its entries."""
         jetstream = client.jetstream(timeout=JETSTREAM_TIMEOUT_S)
         try:
             bucket = await jetstream.key_value(BUCKET)
         except NotFoundError:
             bucket = await jetstream.create_key_value(bucket=BUCKET, history=1)
         made = await jetstream.stream_info(STREAM)
-        check_keys_stay(made.config)
         self._made_at, self._checked_at = str(made.created), time.monotonic()
+        self._settings = made.config
         entries = []
         for keys in (f"{subscription_keys(self._prefix)}*.*.*", f"{status_keys(self._prefix)}*"):
             async with reading(jetstream, BUCKET, keys) as reader:
