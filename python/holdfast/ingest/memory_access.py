@@ -620,7 +620,7 @@ def _decoded(body: bytes | bytearray | memoryview) -> object:
     try:
         return _DOCUMENT.decode(body)
     except MALFORMED_JSON as error:
-        raise Refused("malformed", f"not JSON: {malformed_text(error)}") from None
+        raise Refused("malformed", f"not JSON: {malformed_text(error, body)}") from None
 
 
 def _keys_wrong(command: Mapping[str, object]) -> str:

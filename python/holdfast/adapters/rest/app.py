@@ -211,7 +211,7 @@ class App(Application):
             request_body = msgspec.json.decode(body, type=EndSession)
             listener, number = parse_session_id(request_body.id)
         except ValueError as error:
-            raise malformed(malformed_text(error)) from None
+            raise malformed(malformed_text(error, body)) from None
         by = {"listener": "rest", "peer": request.peer, "source": request.who}
         if not await asyncio.to_thread(self._sessions.end_session, listener, number, by):
             raise BadRequest("unknown_session", f"no session {shown(request_body.id)}")

@@ -131,7 +131,7 @@ class TentacleNext:
         except msgspec.ValidationError as error:
             raise Refused(f"{error}, {COMMAND_FORM}") from None
         except MALFORMED_JSON as error:
-            raise Refused(f"not JSON: {malformed_text(error)}; {COMMAND_FORM}") from None
+            raise Refused(f"not JSON: {malformed_text(error, data)}; {COMMAND_FORM}") from None
         if value is None or type(value) is dict:
             found = "null" if value is None else "an object"
             raise Refused(f"the value is {found}, allowed: numbers, booleans, texts and arrays")

@@ -307,7 +307,7 @@ class DesiredState:
                 msgspec.json.decode(value, type=DesiredDevice)
         except MALFORMED_JSON as error:
             fields = {"bucket": self.bucket, "key": DEVICE + _token(device)}
-            reason = malformed_text(error)
+            reason = malformed_text(error, value)
             log_lines.refused("kept_entry_malformed", kind="fleet", **fields, reason=reason)
             return b""
         return value

@@ -62,7 +62,7 @@ async def ask(
                 try:
                     return msgspec.json.decode(message.data, type=kind)
                 except MALFORMED_JSON as error:
-                    _note(where, message.data, malformed_text(error))
+                    _note(where, message.data, malformed_text(error, message.data))
     except TimeoutError:
         raise NoAnswer from None
     finally:

@@ -16,5 +16,7 @@ def ends(payload: bytes, node: str) -> bool:
     try:
         return msgspec.json.decode(payload, type=ShutdownRequest).node == node
     except MALFORMED_JSON as error:
-        log_lines.refused("message_malformed", kind="shutdown", reason=malformed_text(error))
+        log_lines.refused(
+            "message_malformed", kind="shutdown", reason=malformed_text(error, payload)
+        )
         return False

@@ -60,10 +60,11 @@ class EnabledKey:
         if self._key not in found:
             return
         written = found[self._key]
+        value = b"" if written is None else written.value
         try:
-            enabled = written is None or msgspec.json.decode(written.value, type=_State).enabled
+            enabled = written is None or msgspec.json.decode(value, type=_State).enabled
         except MALFORMED_JSON as error:
-            reason = malformed_text(error)
+            reason = malformed_text(error, value)
             log_lines.refused(
                 "enabled_entry_malformed", kind="enabled", key=self._key, reason=reason
             )

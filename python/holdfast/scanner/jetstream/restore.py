@@ -253,7 +253,7 @@ class StoredSubscriptions(Placement):
                     continue
                 request = restored(value)
             except (Refused, *MALFORMED_JSON) as error:
-                reason = malformed_text(error)
+                reason = malformed_text(error, value)
                 log_lines.refused("kept_entry_malformed", kind="kept", key=key, reason=reason)
                 continue
             owner = SubscriptionKey.of(request)

@@ -170,7 +170,7 @@ def _exact(data: bytes, kind: type[Decoded]) -> Decoded:
         except msgspec.ValidationError:
             return _converted(msgspec.json.decode(data), kind)
     except MALFORMED_JSON as error:
-        raise Refused(f"not JSON: {malformed_text(error)}") from None
+        raise Refused(f"not JSON: {malformed_text(error, data)}") from None
 
 
 def _converted(value: Any, kind: type[Decoded]) -> Decoded:
