@@ -15,7 +15,14 @@ from nats.aio.msg import Msg
 from holdfast.client.url import NetworkTarget
 from holdfast.net.nats import batch
 from holdfast.net.nats import outbox as outboxes
-from holdfast.net.nats.connection import MAX_PAUSE_S, NatsConnection, Ping, Servers
+from holdfast.net.nats.connection import (
+    FIRST_PAUSE_S,
+    MAX_PAUSE_S,
+    PROVEN_S,
+    NatsConnection,
+    Ping,
+    Servers,
+)
 from holdfast.net.nats.outbox import Outbox
 from holdfast.net.nats.tolerant_client import SafeClient
 from holdfast.scanner import responder
@@ -436,10 +443,17 @@ def test_a_server_that_ends_each_connection_is_asked_less_and_less_often() -> No
     client = SafeClient()
     client.options = {}
     broker = NatsConnection(Servers(), {}, lambda _: None, Ping(), name="test")
-    for _ in range(10):
+
+    def pause_after(connection_s: float) -> float:
         broker._note_connected(client)
+        broker._connected_at -= connection_s
         broker._note_lost("tested")
-    assert client.options["reconnect_time_wait"] >= 0.75 * MAX_PAUSE_S
+        return float(client.options["reconnect_time_wait"])
+
+    assert max(pause_after(0.0) for _ in range(10)) >= 0.75 * MAX_PAUSE_S
+    assert pause_after(PROVEN_S) <= FIRST_PAUSE_S, "this one was not ended at once"
+    broker._note(client, OSError("refused"))
+    assert client.options["reconnect_time_wait"] <= FIRST_PAUSE_S, "the first failure to connect"
 
 
 def test_messages_flow_in_order_while_they_are_taken() -> None:

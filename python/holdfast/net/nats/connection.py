@@ -28,7 +28,7 @@ from holdfast.net.secret_file import read_secret
 from holdfast.net.secure_channel import SecureChannel, failure_text
 from holdfast.net.tls import NO_FILES, Tls
 from holdfast.runtime import tasks
-from holdfast.runtime.backoff import PROVEN_S, Backoff
+from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -40,6 +40,9 @@ Handler: TypeAlias = "Callable[[Msg], Awaitable[None]]"
 FIRST_PAUSE_S = 0.25
 MAX_PAUSE_S = 2.0
 """Seconds between attempts to connect. Each failure doubles the pause, up to the maximum."""
+
+PROVEN_S = 2.5
+"""After a connection of this many seconds, pauses start from the first: it was not refused."""
 
 LOG_INTERVAL_S = 600.0
 """Seconds before an error, or a failure to connect, with the same reason is logged again."""
@@ -284,6 +287,8 @@ class NatsConnection:
     def _pause(self, client: Client, worked_s: float) -> None:
         """Sets the pause before the next attempt, after a connection that worked for that long."""
         self._pause_s = client.options["reconnect_time_wait"] = self._backoff.failed(worked_s)
+        if worked_s >= PROVEN_S:
+            self._backoff.succeeded()  # The end of a connection is no failure to connect.
 
 
 def _except_answers(handler: Handler) -> Handler:
