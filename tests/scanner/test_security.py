@@ -6,11 +6,11 @@ import asyncio
 import logging
 import socket
 import time
-from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import pytest
-from nats.errors import NoRespondersError
+from nats.aio.client import Client
+from nats.errors import FlushTimeoutError, NoRespondersError
 
 from holdfast.net.nats import connection as broker
 from holdfast.net.nats.connection import Servers
@@ -137,29 +137,48 @@ def test_no_secret_goes_to_a_server_without_tls(run_scanner: Run, tmp_path: Path
             assert connection.recv(1000) == b""
 
 
+def answered(listening: socket.socket, reply: bytes) -> socket.socket:
+    """Accepts a connection, and replies to its first ping."""
+    listening.settimeout(wire.DEADLINE)
+    connection = listening.accept()[0]
+    connection.settimeout(wire.DEADLINE)
+    connection.sendall(
+        b'INFO {"server_id":"x","version":"2.11.0","max_payload":1000,"headers":true}\r\n'
+    )
+    sent = b""
+    while not sent.endswith(b"PING\r\n"):
+        sent += connection.recv(4096)
+    connection.sendall(reply)
+    return connection
+
+
 def test_connections_that_a_server_refuses_are_closed(run_scanner: Run) -> None:
-    hello = b'INFO {"server_id":"x","version":"2.11.0","max_payload":1000,"headers":true}\r\n'
-    with ExitStack() as opened:
-        listening = opened.enter_context(socket.create_server(("127.0.0.1", 0)))
-        listening.settimeout(wire.DEADLINE)
-
-        def answered(reply: bytes) -> socket.socket:
-            connection = opened.enter_context(listening.accept()[0])
-            connection.settimeout(wire.DEADLINE)
-            connection.sendall(hello)
-            sent = b""
-            while not sent.endswith(b"PING\r\n"):
-                sent += connection.recv(4096)
-            connection.sendall(reply)
-            return connection
-
-        run_scanner(
-            wait=False, servers=Servers((f"nats://127.0.0.1:{listening.getsockname()[1]}",))
-        )
-        answered(b"PONG\r\n").shutdown(socket.SHUT_RDWR)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        url = f"nats://127.0.0.1:{listening.getsockname()[1]}"
+        run_scanner(wait=False, servers=Servers((url,)))
+        with answered(listening, b"PONG\r\n") as first:
+            first.shutdown(socket.SHUT_RDWR)
         for _ in range(3):
-            refused = answered(b"-ERR 'Authorization Violation'\r\n")
-            assert refused.recv(1) == b"", "it is closed, though this side is still open"
+            with answered(listening, b"-ERR 'Authorization Violation'\r\n") as refused:
+                assert refused.recv(1) == b"", "it is closed, though this side is still open"
+
+
+def test_a_server_that_ends_the_connection_at_once_is_quoted(
+    run_scanner: Run, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def flush(client: Client, _: float = 0) -> None:
+        while not client.is_closed:
+            await asyncio.sleep(0)
+        raise FlushTimeoutError  # After 2 s, in nats-py.
+
+    monkeypatch.setattr(Client, "flush", flush)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        url = f"nats://127.0.0.1:{listening.getsockname()[1]}"
+        run_scanner(wait=False, servers=Servers((url,)))
+        answered(listening, b"PONG\r\n-ERR 'too many friends'\r\n").close()
+        wire.until(lambda: logged(caplog, "nats_disconnected"), "it is logged")
+    [lost] = logged(caplog, "nats_disconnected")
+    assert lost["reason"] == "the server ended the connection: too many friends"
 
 
 def test_a_token_opens_the_door(run_scanner: Run, serve_nats: Serve, tmp_path: Path) -> None:

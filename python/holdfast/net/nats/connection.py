@@ -215,7 +215,8 @@ class NatsConnection:
         except (Error, AttributeError, LookupError, TypeError, ValueError) as error:
             self._note(client, error)
             return
-        self._note_connected(client)
+        if self.client is not client and not client.is_reconnecting:  # `again` notes these.
+            self._note_connected(client)
         listening = self._listening = asyncio.create_task(self._listen(client, ended))
         try:
             await _given_up(client, ended)

@@ -13,6 +13,7 @@ server answers pings in order, so what follows an answer was sent after the ping
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import math
 from collections import deque
@@ -23,7 +24,7 @@ from urllib.parse import urlsplit
 from nats.aio.client import DEFAULT_FLUSH_TIMEOUT, Client
 from nats.aio.msg import Msg
 from nats.aio.transport import TcpTransport
-from nats.errors import Error, ProtocolError
+from nats.errors import Error, FlushTimeoutError, ProtocolError
 from nats.protocol.parser import PERMISSIONS_ERR
 
 from holdfast.events import log_lines
@@ -393,9 +394,14 @@ class SafeClient(Client):
         return self.is_reconnecting and task is not None and task.done()
 
     async def connect(self, *args: Any, **options: Any) -> None:
-        """Connects, and learns the limits of the account, which come after the first answer."""
+        """Connects, and learns the limits of the account, which come after the first answer.
+
+        A server that is mute from then on is found by pings. One that has ended the connection has
+        said why, and `loss_reason` has it.
+        """
         await super().connect(*args, **options)
-        await self.flush(self.options["connect_timeout"])
+        with contextlib.suppress(FlushTimeoutError):
+            await self.flush(self.options["connect_timeout"])
 
     async def flush(self, timeout: int = DEFAULT_FLUSH_TIMEOUT) -> None:
         """Waits until the server has all that was sent, and has answered it.
