@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -22,7 +23,8 @@ from holdfast.scanner.fleet.command_order import CommandOrder
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
 from holdfast.scanner.fleet.nodes import Executed, OtherNodes
 from holdfast.scanner.fleet.observer import FleetObserver, FleetUnavailable
-from holdfast.scanner.messages.types import Answer
+from holdfast.scanner.fleet.placement import FleetPlacement
+from holdfast.scanner.messages.types import Announcement, Answer
 from holdfast.scanner.settings import FleetSettings, Settings
 from holdfast.tags import Tag, TagList
 from support.nats_bus import logged
@@ -100,6 +102,26 @@ def test_a_profile_with_other_tags_is_a_difference() -> None:
     assert re.sub("[0-9a-f]{16}", "N", found) == (
         "profiles is pump (tags N), and no others in the fleet"
     )
+
+
+def test_a_bucket_that_this_node_finds_later_is_its_own() -> None:
+    desired = SimpleNamespace(made_at="own")
+    settings = SimpleNamespace(name="plant")
+    stub = SimpleNamespace(
+        desired=desired,
+        partition_leases=SimpleNamespace(settings=settings),
+        _other_buckets={"found later": time.monotonic() - 1000.0},
+    )
+    other = Announcement(started_at=1, fleet="plant", bucket="found later")
+
+    def shares_devices() -> bool:
+        return FleetPlacement.shares_devices(cast("FleetPlacement", stub), other)
+
+    assert not shares_devices()
+    desired.made_at = "found later"
+    assert shares_devices()
+    desired.made_at = "own"
+    assert shares_devices(), "the time to find it begins again"
 
 
 class Bucket:

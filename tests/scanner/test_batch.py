@@ -298,6 +298,20 @@ def test_the_newest_list_of_a_cluster_counts_up_to_a_limit() -> None:
         assert found == {"configured:1", *listed}
 
 
+def test_a_limit_of_the_server_is_a_number() -> None:
+    async def limit() -> int:
+        client = SafeClient()
+        client.transport._io_reader = reader = asyncio.StreamReader()
+        client._setup_server_pool(["nats://configured:1"])
+        client._current_server = client._server_pool[0]
+        for value in (b"512", b"true", b'"2"', b"null"):
+            reader.feed_data(b'INFO {"max_payload": %b}\r\n' % value)
+        await client._ps.parse(await client.transport.read(2**20))
+        return client.max_payload
+
+    assert asyncio.run(limit()) == 512
+
+
 def test_a_server_that_takes_no_more_bytes_does_not_hold_up_the_end_of_a_connection() -> None:
     async def ends(port: int) -> None:
         transport = SafeClient().transport

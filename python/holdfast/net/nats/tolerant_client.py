@@ -446,7 +446,8 @@ class SafeClient(Client):
         """Takes limits that have changed, which nats-py ignores, and the servers of the cluster in
         place of those listed before, which it keeps.
         """
-        if isinstance(max_payload := info.get("max_payload"), int):
+        max_payload = info.get("max_payload")
+        if type(max_payload) is int:  # `True` is one for `isinstance`.
             self._max_payload = max_payload
         if listed := info.get("connect_urls"):
             self._server_pool[:] = [
