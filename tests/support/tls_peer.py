@@ -81,6 +81,11 @@ class Peer:
 
     def shake(self) -> Self:
         """Performs the handshake, as far as the client takes part in it."""
+        self._send(self.shake_unsent())
+        return self
+
+    def shake_unsent(self) -> bytes:
+        """As `shake`, but returns the last records of the client without sending them."""
         while True:
             try:
                 self.tls.do_handshake()
@@ -90,8 +95,7 @@ class Peer:
             except ssl.SSLError as error:
                 raise Refused(error.reason) from None
             else:
-                self.flush()
-                return self
+                return self._out.read()
 
     def hello(self) -> bytes:
         """Returns the ClientHello without sending it."""

@@ -422,6 +422,22 @@ def test_an_authority_that_is_removed_is_not_trusted_any_more(
     assert is_served(service, files.trust(other.issue("panel", CLIENT)))
 
 
+def test_a_handshake_that_new_files_overtake_is_judged_by_them(
+    start: Start, files: Files, tmp_path: Path
+) -> None:
+    other = Authority(tmp_path, "other")
+    own, https = files.server, files.mutual()
+    service = start(https)
+    with Peer(service.address, files.trust(files.client, "1.3")) as peer:
+        service.until_counted("accepted")
+        unsent = peer.shake_unsent()
+        https.adopt(Https(HttpsFiles(own.certificate, own.key, client_ca_file=other.ca)))
+        peer.wire.send(unsent + peer.seal(HEALTH))
+        with contextlib.suppress(Refused):
+            assert peer.rest() == b""
+    service.until_counted("tls_failed")
+
+
 def test_connections_without_a_certificate_end_when_clients_begin_to_need_one(
     start: Start, files: Files, log: web.Records
 ) -> None:

@@ -20,7 +20,7 @@ use tokio::sync::watch;
 use tokio::time::{sleep_until, timeout_at};
 
 use super::exchange::{Abandoned, Event, Exchange, Order, RequestHead, ResponseHead};
-use super::front::Front;
+use super::front::{Front, fails};
 use super::line::{ConnectionEnd, NEVER, SharedLine, Wire};
 use super::refusal::{Refusal, RefusalBody};
 use super::request_bytes::MAX_HEADER_BYTES;
@@ -93,6 +93,11 @@ async fn begin(
             let limit = due.saturating_duration_since(Instant::now());
             let (stream, peer) =
                 secured(&tls, context, (stream, peer), ticket, limit, stop).await?;
+            let now = front.tls()?;
+            if context.end_after_reload((&*tls, &*now), (ticket, &peer), fails) {
+                front.inbox.wake();
+                return None;
+            }
             return Some((Box::new(stream), peer));
         }
         Ok(Ok(1)) => {

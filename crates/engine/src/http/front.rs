@@ -15,6 +15,7 @@ use crate::server::connections::admission::ConnectionLimits;
 use crate::server::connections::listener::ListenerContext;
 use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::event::{Kind, Reporter};
+use crate::tls::TlsFailure;
 use crate::tls::server::ServerTls;
 
 #[derive(Debug)]
@@ -82,4 +83,15 @@ impl Front {
     pub(super) fn exchange(&self) -> Arc<Exchange> {
         Exchange::new(self.next.fetch_add(1, Ordering::Relaxed), Arc::clone(&self.inbox))
     }
+}
+
+/// Why a connection that began with the certificates `before` ends, now that these have taken their place;
+/// `None` if it stays.
+pub(super) fn fails(tls: &ServerTls, before: &ServerTls, peer: &Peer) -> Option<Kind> {
+    let requires_now = tls.requires_certificate() && !before.requires_certificate();
+    let failure = match &peer.certificate {
+        Some(certificate) => tls.judge(certificate).err()?,
+        None => requires_now.then_some(TlsFailure::NoCertificate)?,
+    };
+    Some(Kind::TlsFailed(failure.reason()))
 }

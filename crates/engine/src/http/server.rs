@@ -13,7 +13,7 @@ use tokio::time::sleep;
 
 use super::connection::serve;
 use super::exchange::Event;
-use super::front::{Front, HttpSettings};
+use super::front::{Front, HttpSettings, fails};
 use super::inbox::Inbox;
 use crate::heartbeat::Heartbeat;
 use crate::server::Peer;
@@ -22,7 +22,6 @@ use crate::server::connections::reloadable::Reloadable;
 use crate::server::reports::counters::ConnectionCounters;
 use crate::server::reports::event::{self, Events, Kind, Verbosity};
 use crate::server::rights::sources::contain;
-use crate::tls::TlsFailure;
 use crate::tls::server::ServerTls;
 use crate::wake::Wakes;
 
@@ -163,26 +162,19 @@ impl HttpServer {
     /// Uses these certificates for new connections, and judges open ones by them. If clients need a
     /// certificate from now on, connections without one end, also those within the handshake.
     pub fn set_tls(&self, tls: Arc<ServerTls>) {
-        let requires = tls.requires_certificate();
         let before = self.front.set_tls(tls);
-        self.judge(requires && before.is_some_and(|before| !before.requires_certificate()));
+        self.judge(before.as_deref());
     }
 
     /// Judges the certificates of open connections again. Those that fail are ended.
     pub fn review(&self) {
-        self.judge(false);
+        self.judge(None);
     }
 
-    fn judge(&self, requires_certificate: bool) {
+    fn judge(&self, before: Option<&ServerTls>) {
         let Some(tls) = self.front.tls() else { return };
-        let fails = |peer: &Peer| {
-            let failure = match &peer.certificate {
-                Some(certificate) => tls.judge(certificate).err()?,
-                None => requires_certificate.then_some(TlsFailure::NoCertificate)?,
-            };
-            Some(Kind::TlsFailed(failure.reason()))
-        };
-        for (peer, kind) in self.front.context.admission.review(fails) {
+        let before = before.unwrap_or(&tls);
+        for (peer, kind) in self.front.context.admission.review(|peer| fails(&tls, before, peer)) {
             self.front.ended(kind, peer);
         }
     }

@@ -148,18 +148,18 @@ impl ListenerContext {
     }
 
     /// Ends a connection that a reload during its handshake would have ended, if that reload had known
-    /// its certificate. `before` performed the handshake. Returns whether the connection has ended.
-    pub(crate) fn end_after_reload<S: Service>(
+    /// its certificate. `before` performed the handshake; `live` may have taken its place since. `ends` says why
+    /// it ends. Returns whether the connection has ended.
+    pub(crate) fn end_after_reload<T>(
         &self,
-        before: &S,
-        live: &Reloadable<S>,
+        (before, live): (&T, &T),
         (ticket, peer): (&Ticket, &Peer),
+        ends: impl FnOnce(&T, &T, &Peer) -> Option<Kind>,
     ) -> bool {
-        let service = live.get();
-        if std::ptr::eq(before, &*service) {
+        if std::ptr::eq(before, live) {
             return false;
         }
-        let Some(kind) = service.ends(before, peer) else { return false };
+        let Some(kind) = ends(live, before, peer) else { return false };
         // `None` if the reload did know it, and has counted its end.
         if self.admission.end(ticket.id()).is_some() {
             self.ended(kind, peer.clone());

@@ -323,7 +323,7 @@ impl RawIngest {
         let (time_limit, stopping) = (self.request_timeout, stop.clone());
         let secured = secured(tls, &context, (stream, peer), &ticket, time_limit, stopping).await;
         let Some((stream, peer)) = secured else { return };
-        if context.end_after_reload(self, &live, (&ticket, &peer)) {
+        if context.end_after_reload((self, &*live.get()), (&ticket, &peer), Service::ends) {
             return;
         }
         // A reload reviews connections by their roles. This one looks up its rights only now.
