@@ -8,12 +8,15 @@ use std::collections::{BTreeMap, HashMap};
 use std::net::{IpAddr, SocketAddr};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
+use std::task::Poll;
 use std::time::{Duration, Instant, SystemTime};
 
 use holdfast_runtime::lock;
 use tokio::task::AbortHandle;
 
-use crate::server::connections::eviction::{Activity, EvictionScope, Held};
+use crate::server::connections::eviction::{
+    Activity, CURRENT, ENDED, EvictionScope, Held, OUTDATED,
+};
 use crate::server::connections::peer::Peer;
 use crate::tls::server::PeerCertificate;
 
@@ -176,7 +179,9 @@ impl Admission {
 
     /// The same after a reload: the others look up their rights again, before they answer the next request.
     pub(crate) fn apply_reload<R>(&self, ends: impl Fn(&Peer) -> Option<R>) -> Vec<(Peer, R)> {
-        self.judge(ends, |activity| activity.is_outdated.store(true, Ordering::Release))
+        self.judge(ends, |activity| {
+            activity.validity.fetch_max(OUTDATED, Ordering::Release);
+        })
     }
 
     /// Ends connections. The others stay. Judges without the lock: that may take long, and workers need it for each
@@ -342,9 +347,11 @@ impl Table {
         Some(held)
     }
 
-    /// Removes a connection and aborts its task, which drops the socket.
+    /// Removes a connection and aborts its task, which drops the socket. A task that runs ends only when it has
+    /// to wait, so it looks at its validity before.
     fn end(&mut self, id: u64) -> Option<Held> {
         let held = self.remove(id)?;
+        held.activity.validity.store(ENDED, Ordering::Release);
         if let Some(task) = &held.task {
             task.abort();
         }
@@ -398,16 +405,22 @@ impl Ticket {
         }
     }
 
-    /// Whether rights must be looked up again.
-    pub(crate) fn is_outdated(&self) -> bool {
-        self.activity.is_outdated.load(Ordering::Acquire)
+    /// Whether the connection may go on with the rights that it has.
+    pub(crate) fn is_current(&self) -> bool {
+        self.activity.validity.load(Ordering::Acquire) == CURRENT
     }
 
-    /// As [`is_outdated`](Ticket::is_outdated). The next call returns false.
+    /// Whether rights must be looked up again. The next call returns false. Pending for ever if the connection has
+    /// been ended: whoever did so has reported it, and aborts its task, which must answer nothing more.
     #[inline]
-    pub(crate) fn take_outdated(&self) -> bool {
-        self.activity.is_outdated.load(Ordering::Relaxed)
-            && self.activity.is_outdated.swap(false, Ordering::Acquire)
+    pub(crate) fn poll_outdated(&self) -> Poll<bool> {
+        let validity = &self.activity.validity;
+        if validity.load(Ordering::Relaxed) == CURRENT {
+            return Poll::Ready(false);
+        }
+        let taken =
+            validity.compare_exchange(OUTDATED, CURRENT, Ordering::Acquire, Ordering::Relaxed);
+        if taken.is_ok() { Poll::Ready(true) } else { Poll::Pending }
     }
 
     /// Records what a connection of HTTP waits for, and since when.
@@ -561,7 +574,7 @@ pub(super) mod tests {
         });
         assert_eq!(ended, [(peer(1, 2).into(), ())], "the first has left, the last is new");
         let (_second, third, _new) = begun.take().unwrap();
-        assert!(third.take_outdated());
+        assert_eq!([third.poll_outdated(), third.poll_outdated()], [true, false].map(Poll::Ready));
         assert_eq!(admission.open(), 2);
     }
 

@@ -11,7 +11,7 @@ use std::future::poll_fn;
 use std::io;
 use std::pin::{Pin, pin};
 use std::sync::Arc;
-use std::task::{Context, Poll};
+use std::task::{Context, Poll, ready};
 
 use holdfast_protocol::frame::mbap;
 use holdfast_protocol::pdu;
@@ -220,7 +220,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
                     // Without a budget, both return Pending, and keep no waker: they are polled again.
                     is_armed = coop::has_budget_remaining();
                 }
-                if alarm.is_elapsed() { Poll::Ready(Some(self.on_alarm())) } else { Poll::Pending }
+                if alarm.is_elapsed() { self.on_alarm().map(Some) } else { Poll::Pending }
             });
             match step.await {
                 None => return None,
@@ -279,7 +279,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             self.reads_in_turn += 1;
             let read = read?;
             self.has_read_all = !self.readiness_unknown && read < room;
-            self.renew()?;
+            ready!(self.renew())?;
             self.answering.gives_up =
                 !F::HAS_IDS && self.answering.is_waiting() && self.deadlines.has_given_up();
             let answered = self.answering.answer(&input[..partial + read], output);
@@ -301,7 +301,7 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             };
             self.reads_in_turn += 1;
             if self.answering.behind() > 0 {
-                self.renew()?;
+                ready!(self.renew())?;
                 let (written, taken) = self.answering.resume(&mut output[len..]);
                 len += written;
                 self.share.charge(taken);
@@ -314,17 +314,17 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
         })
     }
 
-    /// Looks up rights and timeouts again after a reload.
+    /// Looks up rights and timeouts again after a reload. Pending if the connection has been ended.
     #[inline]
-    fn renew(&mut self) -> Result<(), Kind> {
-        if self.ticket.take_outdated() {
+    fn renew(&mut self) -> Poll<Result<(), Kind>> {
+        if ready!(self.ticket.poll_outdated()) {
             let Terms { rights, timeouts } =
                 self.renewal.terms(&self.answering.peer).ok_or(Kind::RightsRevoked)?;
             (self.answering.rights, self.deadlines.timeouts) = (rights, timeouts);
             // Other rights refuse other requests: each first one is reported again.
             self.answering.reported = Reported::default();
         }
-        Ok(())
+        Poll::Ready(Ok(()))
     }
 
     /// Notes the work of the source, and the times that the deadlines depend on.
@@ -382,9 +382,9 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
     }
 
     /// Discards the beginning of a request that nothing followed, or ends the connection.
-    fn on_alarm(&mut self) -> Result<(), Kind> {
+    fn on_alarm(&mut self) -> Poll<Result<(), Kind>> {
         // The alarm may be that of a timeout which a reload has changed.
-        self.renew()?;
+        ready!(self.renew())?;
         let now = Instant::now();
         match self.deadlines.expired(now, self.exchange()) {
             Expired::Nothing => {}
@@ -397,9 +397,9 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
                 self.answering.discard_partial();
                 self.deadlines.note_complete();
             }
-            Expired::Connection(kind) => return Err(kind),
+            Expired::Connection(kind) => return Poll::Ready(Err(kind)),
         }
-        Ok(())
+        Poll::Ready(Ok(()))
     }
 
     /// Answers what the system has already received, then ends. The engine drops connections whose
@@ -658,6 +658,7 @@ impl<F: Framing> Answering<F> {
 
 #[cfg(test)]
 mod tests {
+    use std::io::{Read, Write};
     use std::net::SocketAddr;
     use std::time::Duration;
 
@@ -908,10 +909,31 @@ mod tests {
         connection.share.charge(1_000_000);
         let mut context = Context::from_waker(std::task::Waker::noop());
         assert!(connection.poll(&mut context).is_pending());
-        assert_eq!(connection.on_alarm(), Ok(()));
+        assert_eq!(connection.on_alarm(), Poll::Ready(Ok(())));
         drop(other);
         assert!(connection.poll(&mut context).is_pending(), "nothing has arrived");
-        assert_eq!(connection.on_alarm(), Err(Kind::RequestTimeout));
+        assert_eq!(connection.on_alarm(), Poll::Ready(Err(Kind::RequestTimeout)));
+    }
+
+    #[test]
+    fn a_connection_that_was_ended_answers_nothing() {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let _guard = runtime.enter();
+        let (mut connection, bound) = connection::<Mbap>();
+        let limits = ConnectionLimits { max_connections: 1, ..ConnectionLimits::NONE };
+        let admission = Arc::new(Admission::new(limits));
+        connection.ticket = admission.admit(SocketAddr::from(([192, 0, 2, 1], 1))).unwrap().0;
+        let mut peer = bound.accept().unwrap().0;
+        peer.write_all(&frame(1, &[17]).repeat(2)).unwrap();
+        runtime.block_on(connection.stream.readable()).unwrap();
+        assert!(admission.end(connection.ticket.id()).is_some());
+        let mut context = Context::from_waker(std::task::Waker::noop());
+        for _ in 0..2 {
+            assert_eq!(connection.poll(&mut context), Poll::Pending);
+            assert_eq!(connection.on_alarm(), Poll::Pending);
+        }
+        drop(connection);
+        assert!(!matches!(peer.read(&mut [0; 16]), Ok(1..)));
     }
 
     struct WithoutLimit(Arc<PeerRights>);
@@ -933,9 +955,9 @@ mod tests {
         connection.ticket = admission.admit(SocketAddr::from(([192, 0, 2, 1], 1))).unwrap().0;
         connection.renewal = Arc::new(WithoutLimit(Arc::clone(&connection.answering.rights)));
         connection.deadlines.timeouts.idle = Some(Duration::ZERO);
-        assert_eq!(connection.on_alarm(), Err(Kind::Idle));
+        assert_eq!(connection.on_alarm(), Poll::Ready(Err(Kind::Idle)));
         admission.apply_reload(|_| None::<Kind>);
-        assert_eq!(connection.on_alarm(), Ok(()));
+        assert_eq!(connection.on_alarm(), Poll::Ready(Ok(())));
     }
 
     #[test]

@@ -7,7 +7,7 @@
 use std::collections::{BTreeMap, HashMap};
 use std::net::IpAddr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering};
 use std::time::{Duration, SystemTime};
 
 use tokio::task::AbortHandle;
@@ -111,9 +111,16 @@ pub(super) struct Activity {
     pub(super) is_served: AtomicBool,
     /// Whether the connection has had its last reply, and waits for its peer to close.
     pub(super) is_answered: AtomicBool,
-    /// Whether the connection must look up its rights again.
-    pub(super) is_outdated: AtomicBool,
+    /// [`CURRENT`], [`OUTDATED`] or [`ENDED`].
+    pub(super) validity: AtomicU8,
 }
+
+/// A connection may go on with the rights that it has. Each of these values outweighs the one before it.
+pub(super) const CURRENT: u8 = 0;
+/// The connection must look up its rights again.
+pub(super) const OUTDATED: u8 = 1;
+/// The connection has been ended. Its task may not have noticed.
+pub(super) const ENDED: u8 = 2;
 
 impl Held {
     /// The order in which sessions give way. Only those of HTTP have a `grace`: one that has just had its

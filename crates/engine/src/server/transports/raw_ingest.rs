@@ -430,9 +430,9 @@ impl RawIngest {
         Ok(())
     }
 
-    /// Looks up the rights of a connection again after a reload.
-    fn renew<S>(&self, sending: &mut Sending<S>, renewal: &Renewal) -> Result<(), Kind> {
-        if sending.ticket.take_outdated() {
+    /// Looks up the rights of a connection again after a reload. Goes no further if the connection has been ended.
+    async fn renew<S>(&self, sending: &mut Sending<S>, renewal: &Renewal) -> Result<(), Kind> {
+        if poll_fn(|_| sending.ticket.poll_outdated()).await {
             let renewed = renewal().filter(|rights| rights.dialect == self.dialect);
             sending.rights = renewed.ok_or(Kind::RightsRevoked)?;
         }
@@ -449,7 +449,7 @@ impl RawIngest {
         let deadline = Instant::now() + self.request_timeout;
         loop {
             sending.ticket.set_amid_exchange(sending.is_amid_packet());
-            self.renew(sending, renewal)?;
+            self.renew(sending, renewal).await?;
             let missing = match self.judge(&sending.rights, &sending.bytes) {
                 Ok(Packet::Incomplete { missing }) => missing,
                 Ok(Packet::Whole { .. }) => return Ok(Ok(())),
@@ -545,7 +545,7 @@ impl RawIngest {
         let mut answered = 0;
         let mut packets: usize = 0;
         loop {
-            if let Err(revoked) = self.renew(&mut sending, &renewal) {
+            if let Err(revoked) = self.renew(&mut sending, &renewal).await {
                 end = revoked;
                 break;
             }
@@ -766,8 +766,8 @@ impl Service for RawIngest {
             return connection;
         };
         let mut bytes = &chunk[..len];
-        // A reload may have taken place since it was accepted: then its task looks up its rights.
-        if !connection.ticket.is_outdated()
+        // A reload may have taken place since it was accepted: then its task looks up its rights, or ends.
+        if connection.ticket.is_current()
             && let Ok(Packet::Whole { header, memory, payload }) =
                 self.judge(&connection.rights, bytes)
             && !memory.has_journal()
@@ -1198,7 +1198,7 @@ mod tests {
     }
 
     #[test]
-    fn a_packet_is_not_answered_at_once_by_the_rights_before_a_reload() {
+    fn a_packet_is_not_answered_by_the_rights_before_a_reload_or_an_end() {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let _guard = runtime.enter();
         let header = Header {
@@ -1209,7 +1209,16 @@ mod tests {
         };
         let mut packet = vec![0; Format::V1.packet_len(&header)];
         Format::V1.encode_to_slice(&header, &[0, 7], &mut packet).unwrap();
-        for is_reloaded in [false, true] {
+        let context = Arc::new(ListenerContext::for_tests());
+        let (_engine, stop) = watch::channel(false);
+        let nothing: fn(&Admission) = |_| ();
+        let reload: fn(&Admission) = |admission| drop(admission.apply_reload(|_| None::<Kind>));
+        let ending: fn(&Admission) = |admission| drop(admission.apply_reload(|_| Some(())));
+        let closing: fn(&Admission) = |admission| drop(admission.close());
+        for (packets, change) in [PacketsPerConnection::One, MANY]
+            .into_iter()
+            .flat_map(|packets| [nothing, reload, ending, closing].map(|change| (packets, change)))
+        {
             let (mut client, accepted, peer) = connected();
             client.write_all(&packet).unwrap();
             while accepted.peek(&mut vec![0; packet.len()]).unwrap() < packet.len() {}
@@ -1217,13 +1226,24 @@ mod tests {
             let admission = Arc::new(Admission::new(limits));
             let (ticket, _) = admission.admit(peer).unwrap();
             let connection = Admitted { ticket, ..admitted(accepted, peer, Vec::new()) };
-            if is_reloaded {
-                admission.apply_reload(|_| None::<Kind>);
+            change(&admission);
+            let (is_current, is_ended) = (connection.ticket.is_current(), admission.open() == 0);
+            let is_only = matches!(packets, PacketsPerConnection::One);
+            let live =
+                Arc::new(Reloadable::new(listener_with(((Format::V1, Flags::Strict), packets))));
+            let raw = live.get();
+            let mut connection = raw.serve_at_once(&context, connection);
+            assert_eq!(connection.received == packet, is_only && !is_current);
+            assert_eq!(raw.packets.accepted.get(), u64::from(is_only && is_current));
+            if is_ended {
+                // As if its task had just read the packet.
+                connection.received.clone_from(&packet);
+                let (context, stop) = (Arc::clone(&context), stop.clone());
+                let mut serving = Arc::clone(&raw).serve(live, context, connection, stop);
+                let mut task = Context::from_waker(std::task::Waker::noop());
+                assert!(serving.as_mut().poll(&mut task).is_pending(), "its task is aborted here");
+                assert_eq!(raw.packets.accepted.get(), 0);
             }
-            let raw = listener(Format::V1, Flags::Strict);
-            let connection = raw.serve_at_once(&ListenerContext::for_tests(), connection);
-            assert_eq!(connection.received == packet, is_reloaded);
-            assert_eq!(raw.packets.accepted.get(), u64::from(!is_reloaded));
         }
     }
 
