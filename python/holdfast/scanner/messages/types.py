@@ -69,7 +69,8 @@ class TagRequest(Request):
     null: Annotated[list[Marker], Meta(max_length=32)] | None = None
     """Values that mean "not available"; they are published as `null`."""
     profile: Id | None = None
-    """A profile of the configuration, whose tag of this id applies in place of all else."""
+    """A profile of the configuration, whose tag of this id applies in place of all else but
+    `description` and a `writable` of false."""
 
 
 class PlanRequest(Request, rename=None):
