@@ -17,7 +17,7 @@ pub(super) const STATUS_INTERVAL: Duration = Duration::from_secs(1);
 /// The size of the device name, in bytes.
 const NAME_BYTES: usize = 16;
 
-// The registers of a block, as in docs/devices.md. 11 to 19 are not used, and 0.
+// The registers of a block, as in docs/devices.md. 11 to 19 are not used: they are 0.
 const HEALTH_AT: usize = 0;
 const LAST_ERROR_AT: usize = 1;
 const SECONDS_IN_ERROR_AT: usize = 2;

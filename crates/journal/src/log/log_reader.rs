@@ -186,14 +186,10 @@ impl Reading {
                 return Ok(None);
             }
             // Also a message that was applied before is shown, with its steps.
-            let is_other = received.is_of_other_log(self.log_id.as_deref());
             let decoded = message::decode(&received.payload, &self.state.members).ok();
+            let applied = received.apply_to(&mut self.state, self.log_id.as_deref(), |_| None)?;
+            let is_other = matches!(applied, Applied::Ignored(MessageError::OtherLog));
             let decoded = decoded.filter(|_| !is_other);
-            let applied = if is_other {
-                self.state.ignore(position, MessageError::OtherLog)
-            } else {
-                self.state.apply(position, &received.payload, |_| None)?
-            };
             let (fresh, outcomes, sealed) = match applied {
                 Applied::Fresh { outcomes, sealed, .. } => (true, outcomes, sealed),
                 Applied::Stale(_) | Applied::Ignored(_) => (false, Vec::new(), Vec::new()),

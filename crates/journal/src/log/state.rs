@@ -65,7 +65,7 @@ pub(super) enum Applied {
     },
     /// It was applied before, or a later one of the same node was.
     Stale(Origin),
-    /// It is not of a node, or of one for which the log has no room.
+    /// It is of no node, of another log, or of a node for which the log has no room.
     Ignored(MessageError),
 }
 

@@ -92,7 +92,7 @@ pub struct Status {
     pub refused: u64,
     /// Messages that were applied before, or that a later start of their node has overtaken.
     pub stale: u64,
-    /// Messages that are not of a node, or of one for which the log has no room.
+    /// Messages that are of no node, of another log, or of a node for which the log has no room.
     pub ignored: u64,
     pub replicas: usize,
     pub digest: Option<Digest>,

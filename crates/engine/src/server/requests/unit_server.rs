@@ -391,7 +391,7 @@ pub(super) fn exceeds_ranges(rights: &PeerRights, unit_id: u8, request: &[u8]) -
         .is_some_and(|ranges| Request::parse(request).is_ok_and(|request| !ranges.allow(&request)))
 }
 
-/// Checks a request to a device or a journal, before it takes room for its record.
+/// Checks a request to a device, a mirror or a journal, before it takes room for its record.
 fn check_forwarded(
     rights: &PeerRights,
     destination: &RequestDestination,
@@ -413,6 +413,7 @@ fn check_forwarded(
         RequestDestination::Journal(memory) if exceeds_ranges(rights, unit_id, request) => {
             Err(out_of_ranges(memory))
         }
+        // Also parsed when it is submitted: a malformed one takes no room.
         RequestDestination::Journal(_) => Request::parse(request).map(drop),
         RequestDestination::Device(_) | RequestDestination::Mirror(_) => Ok(()),
     }

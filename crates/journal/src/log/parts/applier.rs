@@ -11,7 +11,7 @@ use crate::log::settings::Settings;
 use crate::log::shared::{Checkpoint, Shared};
 use crate::log::state::{Applied, State};
 use crate::log::status::{Event, NodeStatus};
-use crate::log::stream::message::{MessageError, Origin};
+use crate::log::stream::message::Origin;
 use crate::log::stream::raw_message::Received;
 
 /// The contents of this node, and which stream they come from.
@@ -98,11 +98,7 @@ impl Applier {
     ) -> Result<Applied, End> {
         let (shared, position) = (&self.shared, received.position);
         let age = |origin: &Origin| shared.age_since(first_sent(origin));
-        let applied = if received.is_of_other_log(self.stream_id.as_deref()) {
-            self.state.ignore(position, MessageError::OtherLog)
-        } else {
-            self.state.apply(position, &received.payload, age)?
-        };
+        let applied = received.apply_to(&mut self.state, self.stream_id.as_deref(), age)?;
         shared.counters.sequence.set(position.sequence);
         match &applied {
             Applied::Fresh { origin, .. } => {

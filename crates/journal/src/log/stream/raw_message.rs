@@ -1,5 +1,7 @@
 //! A message of a stream, whatever its headers are.
 
+use std::time::Duration;
+
 use async_nats::HeaderMap;
 use async_nats::jetstream::message::StreamMessage;
 use async_nats::jetstream::response::Response;
@@ -9,8 +11,9 @@ use bytes::Bytes;
 use serde::Deserialize;
 use serde_json::Value;
 
-use crate::log::error::End;
-use crate::log::state::StreamPosition;
+use crate::log::error::{End, LogError};
+use crate::log::state::{Applied, State, StreamPosition};
+use crate::log::stream::message::{MessageError, Origin};
 
 /// The beginning of headers without a status, `NATS/1.0` and a carriage return, in base64.
 const WITHOUT_STATUS: &str = "TkFUUy8xLjAN";
@@ -57,9 +60,20 @@ pub(in crate::log) async fn fetch(
 }
 
 impl Received {
-    /// Whether it was sent to another log than the one with this id.
-    pub(in crate::log) fn is_of_other_log(&self, id: Option<&str>) -> bool {
-        self.log_id.is_some() && self.log_id.as_deref() != id
+    /// Applies it as the next message of the log with this id, unless it was sent to another one.
+    ///
+    /// # Errors
+    /// Those of [`State::apply`].
+    pub(in crate::log) fn apply_to(
+        &self,
+        state: &mut State,
+        id: Option<&str>,
+        age: impl FnOnce(&Origin) -> Option<Duration>,
+    ) -> Result<Applied, LogError> {
+        if self.log_id.is_some() && self.log_id.as_deref() != id {
+            return Ok(state.ignore(self.position, MessageError::OtherLog));
+        }
+        state.apply(self.position, &self.payload, age)
     }
 
     /// A message as a server describes it.

@@ -354,7 +354,7 @@ impl Store {
     /// [`End`] if they have lost the key, or a bucket of the log.
     pub(in crate::log) async fn examine(&self) -> Result<Option<(u64, Pointer)>, End> {
         let leases = self.leases.iter().map(|leases| leases.stream_name.clone());
-        let objects = format!("OBJ_{}", self.stream.cached_info().config.name);
+        let objects = self.objects_stream();
         for name in leases.chain([self.keys.stream_name.clone(), objects]) {
             match self.context.get_stream(&name).await {
                 Ok(_) => {}
@@ -371,6 +371,11 @@ impl Store {
             Err(End::Fatal(error)) => Err(End::Lost(error.to_string())),
             Err(_) => Ok(None),
         }
+    }
+
+    /// The name of the stream with the snapshots.
+    fn objects_stream(&self) -> String {
+        format!("OBJ_{}", self.stream.cached_info().config.name)
     }
 
     pub(in crate::log) async fn release(&self) {
@@ -416,7 +421,7 @@ impl Store {
     /// all other snapshots and their parts. Returns the new revision.
     async fn name(&self, seen: Option<u64>, pointer: &Pointer) -> Result<u64, String> {
         let bucket = &self.stream.cached_info().config.name;
-        let objects = self.context.get_stream_no_info(format!("OBJ_{bucket}")).await;
+        let objects = self.context.get_stream_no_info(self.objects_stream()).await;
         let objects = objects.map_err(|error| error.to_string())?;
         // Before the key changes: a node that has stored one of these, and not named it by then, can't name it any
         // more, as its own change of the key expects the former revision.
