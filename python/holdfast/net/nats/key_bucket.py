@@ -33,7 +33,7 @@ from holdfast.net.nats.jetstream_errors import (
 from holdfast.net.nats.tolerant_client import ServerError, as_quoted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from nats.aio.client import Client
     from nats.aio.msg import Msg
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 OPERATION_HEADER = "KV-Operation"
 """The header with which a client deletes a key: `DEL` or `PURGE`."""
 
-MARKER_HEADERS = (OPERATION_HEADER, "Nats-Marker-Reason")
+_MARKER_HEADERS = (OPERATION_HEADER, "Nats-Marker-Reason")
 """The headers of messages that stand for deleted or expired keys."""
 
 
@@ -56,6 +56,11 @@ class _Ack(msgspec.Struct):
 
     seq: int = 0
     error: dict[str, Any] | None = None
+
+
+def is_marker(headers: Mapping[str, str]) -> bool:
+    """Whether a message with these headers stands for a deleted or expired key."""
+    return any(header in headers for header in _MARKER_HEADERS)
 
 
 def first_revision(last_revision: int) -> int:

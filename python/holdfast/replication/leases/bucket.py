@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from nats.js.api import DiscardPolicy
 
-from holdfast.net.nats.key_bucket import MARKER_HEADERS, OPERATION_HEADER, KeyBucket
+from holdfast.net.nats.key_bucket import OPERATION_HEADER, KeyBucket, is_marker
 from holdfast.replication.leases.times import LEASE_TIMES, LeaseTimes
 from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.runtime.text import counted, quote
@@ -58,7 +58,7 @@ class Entry:
 def entry(revision: int, headers: dict[str, str] | None, value: bytes, now: float) -> Entry:
     """The entry of a message of the bucket. One without a valid value is held by nobody."""
     headers = headers or {}
-    if any(header in headers for header in MARKER_HEADERS):
+    if is_marker(headers):
         given_back = headers.get(OPERATION_HEADER) == "DEL"
         return Entry(revision, None, now, is_given_back=given_back)
     try:

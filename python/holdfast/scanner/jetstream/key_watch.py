@@ -20,7 +20,7 @@ from nats.js.api import AckPolicy, ConsumerConfig, DeliverPolicy
 from nats.js.errors import NotFoundError
 
 from holdfast.events import log_lines
-from holdfast.net.nats.key_bucket import MARKER_HEADERS
+from holdfast.net.nats.key_bucket import is_marker
 from holdfast.runtime import tasks
 from holdfast.runtime.backoff import Backoff
 from holdfast.scanner.jetstream.availability import (
@@ -219,11 +219,9 @@ class Reader:
         if number != self._received + 1:  # The server counts what it sends without gaps.
             raise _Missed
         self._received = number
-        headers = message.headers or {}
-        is_marker = any(header in headers for header in MARKER_HEADERS)
         key = message.subject.removeprefix(f"$KV.{self._bucket}.")
         revision = message.metadata.sequence.stream
-        return key, None if is_marker else Written(message.data, revision)
+        return key, None if is_marker(message.headers or {}) else Written(message.data, revision)
 
     async def _check(self) -> None:
         """Checks that the server has the consumer, and delivered nothing that did not arrive."""

@@ -188,9 +188,13 @@ class EntryStore:
         """Whether the bucket is still the one that was read. Raises an error if there is none."""
         if time.monotonic() < self._checked_at + CHECK_INTERVAL_S:
             return True
+        return await self._look(client) == self._made_at
+
+    async def _look(self, client: Client) -> str:
+        """Notes the settings of the bucket. Returns when it was made."""
         found = await client.jetstream(timeout=JETSTREAM_TIMEOUT_S).stream_info(STREAM)
         self._settings, self._checked_at = found.config, time.monotonic()
-        return str(found.created) == self._made_at
+        return str(found.created)
 
     async def _read(self, client: Client) -> KeyValue:
         """Opens the bucket and reports its entries."""
@@ -199,9 +203,7 @@ class EntryStore:
             bucket = await jetstream.key_value(BUCKET)
         except NotFoundError:
             bucket = await jetstream.create_key_value(bucket=BUCKET, history=1)
-        made = await jetstream.stream_info(STREAM)
-        self._made_at, self._checked_at = str(made.created), time.monotonic()
-        self._settings = made.config
+        self._made_at = await self._look(client)
         entries = []
         for keys in (f"{subscription_keys(self._prefix)}*.*.*", f"{status_keys(self._prefix)}*"):
             async with reading(jetstream, BUCKET, keys) as reader:
