@@ -274,7 +274,7 @@ class Placement:
         return False
 
     def announcement(self, started: int, /) -> Announcement:
-        """Returns what others are told of this scanner."""
+        """Returns what this scanner announces to others."""
         return Announcement(started_at=started)
 
     def shares_devices(self, _other: Announcement, /) -> bool:

@@ -88,6 +88,7 @@ def _threads_or_exit() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
+        # Python has no type or number for it, only this text.
         if str(error) != "can't start new thread":
             raise
         fail(error)

@@ -133,10 +133,11 @@ class EdgeNode:
             for device in self._devices
             if answering.get(device) and device not in self._alive
         ]
-        if not new:
-            return []
-        number, known = self._next_number(), latest()
-        return [self._dbirth(device, known.get(device, {}), number) for device in new]
+        return self._dbirths(new, latest) if new else []
+
+    def _dbirths(self, devices: Iterable[str], latest: Latest) -> list[Message]:
+        number, known = self._next_number(), latest()  # In this order, see `DeviceMetrics.birth`.
+        return [self._dbirth(device, known.get(device, {}), number) for device in devices]
 
     def device_deaths(
         self, answering: Mapping[str, bool], readings: Iterable[Reading] = ()
@@ -165,8 +166,7 @@ class EdgeNode:
             if device is None or _is_silent(reading):
                 continue
             if device.device not in self._alive:
-                next_number, known = self._next_number(), latest()
-                yield self._dbirth(device.device, known.get(device.device, {}), next_number)
+                yield from self._dbirths([device.device], latest)
             if device.is_known(reading, number):
                 continue
             payload, names = open_payloads.get(device.device) or (Payload(), set())

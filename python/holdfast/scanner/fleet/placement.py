@@ -106,7 +106,7 @@ class FleetPlacement(FleetMember):
         return self.partition_leases.has_others
 
     def announcement(self, started: int, /) -> Announcement:
-        """Returns what other scanners are told of this one."""
+        """Returns what this node announces to other scanners."""
         fleet = self.partition_leases.settings.name
         return Announcement(started_at=started, fleet=fleet, bucket=self.desired.made_at)
 
