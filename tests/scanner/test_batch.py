@@ -13,7 +13,7 @@ from urllib.parse import urlparse
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from nats.errors import Error, ProtocolError
+from nats.errors import Error, FlushTimeoutError, ProtocolError
 
 from holdfast.net.nats import batch, tolerant_client
 from holdfast.net.nats.outbox import Outbox
@@ -268,6 +268,19 @@ def test_a_flush_waits_until_the_server_has_what_the_client_still_holds(
     inbox = caller.listen("wire.>")
     assert caller.do(work()) == []
     assert [inbox.next() for _ in range(2)] == [0, 1]
+
+
+def test_an_answer_to_a_flush_that_was_given_up_ends_nothing(own_nats: NatsServer) -> None:
+    client = SafeClient()
+    with Caller(own_nats.url, client) as caller:
+        inbox = caller.listen("wire.>")
+        own_nats.freeze()
+        with pytest.raises(FlushTimeoutError):
+            caller.do(client.flush(timeout=0.1))
+        own_nats.thaw()
+        caller.do(client.flush())
+        caller.do(client.publish("wire.a", b"1"))
+        assert inbox.next() == 1
 
 
 def test_addresses_of_servers_that_are_none_are_left_out() -> None:

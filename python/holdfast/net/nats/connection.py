@@ -16,7 +16,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from nats.errors import Error
+from nats.errors import Error, FlushTimeoutError
 from nats.js.errors import APIError, ServiceUnavailableError
 
 from holdfast.events import log_lines
@@ -233,7 +233,7 @@ class NatsConnection:
             if self.until_member is not None:
                 await self.until_member()
             await self._subscribe(client, self.shared, self.queue)
-            await client.flush()
+            await _flushed(client)
             self._subscribed = True
         except (Error, OSError) as error:
             self._note(client, error)
@@ -365,6 +365,22 @@ async def _given_up(client: SafeClient, ended: asyncio.Event) -> None:
     while not (ended.is_set() or client.is_closed or client.has_stopped_reconnecting):
         await tasks.within(CHECK_INTERVAL_S, ended.wait())
     ended.set()
+
+
+async def _flushed(client: SafeClient) -> None:
+    """Waits until the server has all subscriptions. Raises `FlushTimeoutError`.
+
+    A new connection of the same client has them too; who waits for the one before gets no answer.
+    """
+    while True:
+        before = client.stats["reconnects"]
+        try:
+            await client.flush()
+        except FlushTimeoutError:
+            if client.stats["reconnects"] == before:
+                raise
+        else:
+            return
 
 
 async def _closed(client: Client) -> None:

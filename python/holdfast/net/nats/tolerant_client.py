@@ -438,6 +438,13 @@ class SafeClient(Client):
         self._err = ServerError(f"nats: {text}")
         await self._error_cb(self._err)
 
+    async def _process_pong(self) -> None:
+        """Passes over the answer to a flush that was given up: nats-py would end its reading."""
+        if self._pongs and self._pongs[0].done():
+            del self._pongs[0]
+        else:
+            await super()._process_pong()
+
     async def _process_connect_init(self) -> None:
         self.loss_reason = CONNECTION_LOST
         await super()._process_connect_init()
