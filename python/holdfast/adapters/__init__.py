@@ -14,12 +14,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
-from holdfast.ingest import Counts, Grant, MemoryAccess, Refused, Written
 from holdfast.runtime.heartbeat import Heartbeat
+from holdfast.runtime.lazy_names import imported_on_use
 from holdfast.runtime.stop import Stop
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from holdfast.ingest import Counts, Grant, MemoryAccess, Refused, Written
+else:
+    _INGEST = ("Counts", "Grant", "MemoryAccess", "Refused", "Written")
+    __getattr__ = imported_on_use(__name__, dict.fromkeys(_INGEST, "holdfast.ingest"))
 
 __all__ = [
     "Adapter",

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from holdfast.adapters import ENTRY_POINTS, Context, Grant
+from holdfast import ingest
+from holdfast.adapters import ENTRY_POINTS, Context
 from holdfast.runtime.interpreter import complete_hashlib
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def factory(
     Raises `UnknownAdapter` as `entry_point` does.
     """
     found = entry_point(name, settings)
-    grant = Grant(name, settings.memories, settings.areas, settings.access == "read-write")
+    grant = ingest.Grant(name, settings.memories, settings.areas, settings.access == "read-write")
     context = Context(name, memory_access, grant, settings.options)
 
     def make() -> Adapter:

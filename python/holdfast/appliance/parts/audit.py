@@ -11,7 +11,6 @@ from holdfast._core import __version__
 from holdfast.appliance.parts.part import Part
 from holdfast.config.values.urls import parse_syslog
 from holdfast.events import log_lines
-from holdfast.events.audit import Audit, Copies, Journal, Syslog
 from holdfast.runtime.heartbeat import PERIOD_S, Heartbeat
 from holdfast.runtime.standstill import WallClock
 from holdfast.runtime.text import file_error_text
@@ -23,6 +22,7 @@ if TYPE_CHECKING:
     from holdfast.appliance.parts.part import Plan
     from holdfast.config import Config
     from holdfast.config.models.services import AuditConfig
+    from holdfast.events.audit import Audit, Copies
     from holdfast.types import ThreadHeartbeat
 
 # The most writes that are moved to the audit log at once.
@@ -55,6 +55,8 @@ class AuditLog(Part):
         settings = plan.config.audit
         if settings is None:
             return
+        from holdfast.events.audit import Audit
+
         try:
             self.log = log = Audit(
                 settings.file,
@@ -177,6 +179,8 @@ class WriteRecorder:
 
 
 def _copies(settings: AuditConfig) -> list[Copies]:
+    from holdfast.events.audit import Copies, Journal, Syslog
+
     copies = []
     if settings.syslog is not None:
         copies.append(Copies("syslog", Syslog(*parse_syslog(settings.syslog))))

@@ -9,8 +9,6 @@ from holdfast import _core
 from holdfast.appliance.parts import native_devices, native_links
 from holdfast.appliance.parts.device_events import DeviceEvents
 from holdfast.appliance.parts.part import Part
-from holdfast.appliance.parts.tag_values import TagValues
-from holdfast.appliance.parts.tag_writes import TagWrites
 from holdfast.config.checks.units import routed
 from holdfast.events import log_lines
 
@@ -21,6 +19,8 @@ if TYPE_CHECKING:
     from holdfast.appliance.parts.device_leases import DeviceLeases
     from holdfast.appliance.parts.mirrors import Mirrors
     from holdfast.appliance.parts.part import Plan
+    from holdfast.appliance.parts.tag_values import TagValues
+    from holdfast.appliance.parts.tag_writes import TagWrites
     from holdfast.config import Config
     from holdfast.polling import Reading
     from holdfast.types import ThreadHeartbeat
@@ -83,6 +83,9 @@ class Devices(Part):
             plan.undo.callback(poller.stop)
         if poller is not None:
             if values is None and any(config.devices[name].has_tags for name in polled):
+                from holdfast.appliance.parts.tag_values import TagValues
+                from holdfast.appliance.parts.tag_writes import TagWrites
+
                 values = TagValues(poller.new_receiver())
                 writes = TagWrites(poller, self._audit.log, values.find)
             # The first use of an address decides the settings of its connection: links first.

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from holdfast import ingest
 from holdfast.appliance.parts.listeners import ListenAddress
 from holdfast.appliance.parts.part import Part
-from holdfast.ingest import MemoryAccess
 from holdfast.net.http.port import Port
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from holdfast.config import Config
     from holdfast.config.models.server_tls import HttpsConfig
     from holdfast.config.models.services import GatewayConfig, MetricsConfig, RestConfig
+    from holdfast.ingest import MemoryAccess
     from holdfast.net.http.health import HealthSource
     from holdfast.net.http.https import Https
     from holdfast.types import ThreadHeartbeat
@@ -164,7 +165,7 @@ class Services(Part):
         """The way to memory of an adapter. It keeps its counters over reloads."""
         if name not in self._accesses:
             of = self.context
-            self._accesses[name] = MemoryAccess(
+            self._accesses[name] = ingest.MemoryAccess(
                 name, of.memories, of.audit.log, of.devices.passages
             )
         return self._accesses[name]

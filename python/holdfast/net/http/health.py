@@ -8,15 +8,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
-import msgspec
-
-from holdfast.net.http.requests import JSON, Response, response
-
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from holdfast.net.http.host_and_origin import Origins
-    from holdfast.net.http.requests import Request
+    from holdfast.net.http.requests import Request, Response
 
 LIVE = "/health/live"
 READY = "/health/ready"
@@ -47,6 +43,10 @@ def answer(health: HealthSource, request: Request, *, shown_to: Origins | None) 
     The body has the detail of each check only for hosts that `shown_to` admits. For others, it has
     their names and whether they have passed.
     """
+    import msgspec
+
+    from holdfast.net.http.requests import JSON, response
+
     checks = health.live() if request.path == LIVE else health.ready()
     details = shown_to is not None and shown_to.admits(request)
     ok = all(check.ok for check in checks.values())
