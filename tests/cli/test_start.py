@@ -157,7 +157,7 @@ def test_an_appliance_with_a_memory_and_a_listener_imports_no_event_loop(tmp_pat
     file.write_text(PLANT)
     program = """
 import sys
-from holdfast.appliance import Appliance
+from holdfast.cli.services.run import Appliance
 from holdfast.config import load
 from holdfast.config.allowed_words import cached
 with Appliance(load(sys.argv[1])) as appliance:
@@ -166,7 +166,7 @@ print(*sys.modules, sep="\\n", file=sys.stderr)
 """
     printed, heavy = heavy_after(program, str(file))
     assert printed == "modbus 0\n", "the JSON Schema is made for messages only"
-    assert heavy <= {"concurrent.futures", "email", "msgspec", "pydantic", *OWN}
+    assert heavy <= {"email", "pydantic", *OWN}
 
 
 def test_a_configuration_does_not_read_its_own_source() -> None:

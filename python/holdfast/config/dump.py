@@ -13,8 +13,6 @@ from math import isfinite, isnan
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from holdfast.config.text.yaml_document import scalar
 
 WIDTH = 100
@@ -30,7 +28,7 @@ OF_ADAPTER = ("adapters", "options")
 PLAIN = re.compile(r"[A-Za-z0-9_./]([A-Za-z0-9_./+%@-]|:(?=[^ ])| (?=[^ ]))*", re.ASCII)
 """Text that is safe without quotes anywhere in YAML; all other text is quoted."""
 
-ESCAPED = re.compile("[\x7f-\x9f\u2028\u2029\ufeff\ufffe\uffff]")
+ESCAPED = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 """What JSON leaves as it is between quotes, and YAML does not allow or may take as a line break."""
 
 
@@ -109,8 +107,5 @@ def _text(value: object) -> str:
 def _quoted_if_needed(text: str) -> str:
     if PLAIN.fullmatch(text) and scalar(text) == text:
         return text
-    try:
-        quoted = msgspec.json.encode(text).decode()
-    except UnicodeEncodeError:
-        quoted = json.dumps(text)
+    quoted = json.dumps(text, ensure_ascii=False)
     return ESCAPED.sub(lambda found: f"\\u{ord(found[0]):04X}", quoted)

@@ -10,9 +10,6 @@ from decimal import Decimal, InvalidOperation
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
-from holdfast.runtime.malformed_json import MALFORMED_JSON
 from holdfast.runtime.text import quote, would_be_zero
 from holdfast.values import DoesNotFit
 
@@ -100,6 +97,10 @@ def _bytes(text: str, named: str) -> bytes:
 
 
 def _array(text: str, type: Type, named: str, is_measurement: bool) -> list[Any]:
+    import msgspec
+
+    from holdfast.runtime.malformed_json import MALFORMED_JSON
+
     parse = partial(decimal_from, type=type, is_measurement=is_measurement)
     hook = parse if type.is_number else None
     try:

@@ -13,8 +13,6 @@ from fractions import Fraction
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from holdfast.runtime.text import either, quote
 from holdfast.tags.scale import RegisterScale, linear_of
 from holdfast.tags.strict_text import BOOLEANS, decimal_from, from_text
@@ -60,6 +58,8 @@ def text_of(tag: Tag, value: Any, *, states: bool = True) -> str:
     if value is None or value != value:
         return ""
     if isinstance(value, list | tuple):
+        import msgspec
+
         return msgspec.json.encode(plain(tag, value)).decode()
     name = tag.state(value) if states else None
     if name is not None:

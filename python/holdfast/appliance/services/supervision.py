@@ -12,7 +12,6 @@ import os
 import sys
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 from holdfast.config.fingerprint import fingerprint
@@ -49,6 +48,8 @@ class Starter:
     """
 
     def __init__(self) -> None:
+        from concurrent.futures import ThreadPoolExecutor
+
         self._executor = ThreadPoolExecutor(1, "holdfast-starter")
 
     def open(self) -> None:

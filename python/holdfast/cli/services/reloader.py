@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from concurrent.futures import Future
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from holdfast.runtime.text import file_error_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from concurrent.futures import Future
 
     from holdfast.appliance import Appliance
     from holdfast.appliance.service_manager import ServiceManager
@@ -97,6 +97,8 @@ class Reloader:
 
     def ask(self) -> Mapping[str, Any]:
         """Has the appliance reloaded. Waits for the result: what changed, or the problems."""
+        from concurrent.futures import Future
+
         future: Future[Mapping[str, Any]] = Future()
         with self._lock:
             self._requests.append(future)
