@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from holdfast.config.checks.common import unreadable
-from holdfast.config.tag_files.read import KINDS, load_profile
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError
 from holdfast.config.text.raw_access import entries, mapping
@@ -57,6 +56,8 @@ class ProfileFiles:
         profiles[name] = _ANY if isinstance(profile, str) else profile
 
     def _read(self, path: KeyPath, file: object, profiles: dict[str, Any]) -> None:
+        from holdfast.config.tag_files.read import KINDS, load_profile
+
         if not isinstance(file, str) or not file.lower().endswith(KINDS):
             self.report.add(path, f"found {show(file)}, allowed: a file {either(KINDS)}")
             return
