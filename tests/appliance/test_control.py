@@ -12,7 +12,7 @@ from contextlib import ExitStack, suppress
 from functools import partial
 from multiprocessing.connection import Client, Listener
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -33,15 +33,16 @@ class Accepting:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.calls = 0
         self.failures = 0
-        accept = Listener.accept
+        listeners = Listener if sys.platform == "win32" else control._UnixListener
+        accept = listeners.accept
 
-        def accepted(listener: Listener) -> Connection:
+        def accepted(listener: Any) -> Connection:
             self.calls += 1
             if self.calls <= self.failures:
                 raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
             return accept(listener)
 
-        monkeypatch.setattr(Listener, "accept", accepted)
+        monkeypatch.setattr(listeners, "accept", accepted)
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ HEAVY = {
     "http",
     "logging",
     "msgspec",
+    "multiprocessing",
     "nats",
     "paho",
     "prometheus_client",

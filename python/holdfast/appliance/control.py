@@ -13,7 +13,6 @@ import os
 import socket
 import sys
 import threading
-from multiprocessing.connection import Client, Listener
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +20,7 @@ from holdfast.runtime.backoff import Backoff
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
+    from multiprocessing.connection import Listener
 
     Handler = Callable[..., Mapping[str, Any]]
 
@@ -193,23 +193,62 @@ def _answered(file: Path, request: bytes) -> dict[str, Any] | NotRunning:
     return NotRunning(f"{file}: {none} (tried {tried})")
 
 
-def _listen(address: str) -> Listener:
+class _UnixListener:
+    """The `Listener` of Unix. `multiprocessing` is imported for the first caller: most appliances
+    have none, and it takes a megabyte."""
+
+    _address: str
+    _socket: socket.socket
+
+    def __init__(self, address: str) -> None:
+        if sys.platform == "win32":
+            raise AssertionError("only used on other systems")
+        self._address = address
+        self._socket = socket.socket(socket.AF_UNIX)
+        try:
+            self._socket.bind(address)
+            Path(address).chmod(0o600)
+            self._socket.listen(1)
+        except OSError:
+            self._socket.close()
+            raise
+
+    def accept(self) -> Any:
+        return _connection(self._socket.accept()[0])
+
+    def close(self) -> None:
+        self._socket.close()
+        Path(self._address).unlink(missing_ok=True)
+
+
+def _connection(connected: socket.socket) -> Any:
+    """The connection of a socket, which is closed if there can be none."""
+    with connected:
+        from multiprocessing.connection import Connection
+
+        return Connection(connected.detach())
+
+
+def _listen(address: str) -> Listener | _UnixListener:
+    if sys.platform == "win32":
+        from multiprocessing.connection import Listener
+
+        return Listener(address)
     try:
-        listener = Listener(address)
+        return _UnixListener(address)
     except OSError:
-        if sys.platform == "win32" or _is_alive(address):
+        if _is_alive(address):
             raise
         # An appliance that was killed has left it.
         Path(address).unlink(missing_ok=True)
-        listener = Listener(address)
-    if sys.platform != "win32":
-        Path(address).chmod(0o600)
-    return listener
+        return _UnixListener(address)
 
 
 def _is_alive(address: str) -> bool:
     """Connects, without waiting. Returns whether somebody listens there."""
     if sys.platform == "win32":
+        from multiprocessing.connection import Client
+
         with contextlib.suppress(OSError, EOFError), Client(address):
             return True
         return False
@@ -225,10 +264,20 @@ def _is_alive(address: str) -> bool:
 
 
 def _connected(address: str) -> Any:  # A connection, of another type on Windows; or None.
+    if sys.platform == "win32":
+        from multiprocessing.connection import Client
+
+        try:
+            return Client(address)
+        except OSError:
+            return None
+    connected = socket.socket(socket.AF_UNIX)
     try:
-        return Client(address)
+        connected.connect(address)
     except OSError:
+        connected.close()
         return None
+    return _connection(connected)
 
 
 def _own_addresses(file: Path) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import sys
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -320,7 +319,7 @@ def _example(areas: Mapping[Area, range], rights: UnitRights) -> tuple[Area, ran
 def _program() -> str:
     """The name with which this program was called, or its path if a shell can't find it."""
     name = click.get_current_context().find_root().info_name or "holdfast"
-    if name == "holdfast" and shutil.which(name) is None:
+    if name == "holdfast" and Path(sys.argv[0]).parent not in map(Path, os.get_exec_path()):
         try:
             return shell_command(os.path.relpath(sys.argv[0]))
         except ValueError:  # Windows has no way from one drive to another.
