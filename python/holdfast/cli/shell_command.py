@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import shlex
-import subprocess
 import sys
 
 
 def shell_command(*words: object) -> str:
     """A command line that gives a program exactly these words."""
     texts = list(map(str, words))
-    return subprocess.list2cmdline(texts) if sys.platform == "win32" else shlex.join(texts)
+    if sys.platform == "win32":
+        import subprocess
+
+        return subprocess.list2cmdline(texts)
+    return shlex.join(texts)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.config.schema import cached
 from holdfast.config.text.raw_access import entries, mapping
 from holdfast.runtime.text import either, listing
 
@@ -36,8 +35,15 @@ def known_keys(path: KeyPath, data: object) -> list[str]:
     return list(dict.fromkeys(keys))
 
 
+def _schema() -> Node:
+    # A valid configuration needs none of this.
+    from holdfast.config.schema import cached
+
+    return cached()
+
+
 def _at(path: KeyPath, data: object) -> list[Node]:
-    nodes = [cached()]
+    nodes = [_schema()]
     for index, part in enumerate(path):
         value = _value(path[:index], data)
         nodes = [child for node in nodes for child in _children(node, part, value)]
@@ -80,7 +86,7 @@ def _resolved(node: Node) -> Node:
         node = node["else"]  # Devices; those with `for` have been expanded.
     if "$ref" not in node:
         return node
-    target: Node = cached()["$defs"][node["$ref"].rpartition("/")[2]]
+    target: Node = _schema()["$defs"][node["$ref"].rpartition("/")[2]]
     return target
 
 

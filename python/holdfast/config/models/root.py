@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, PrivateAttr
 
-from holdfast.config import dump
 from holdfast.config.models.base import Model
 from holdfast.config.models.devices import DeviceConfig
 from holdfast.config.models.links import LinkConfig
@@ -214,8 +213,12 @@ class Config(Model):
 
     def dump(self) -> str:
         """The effective configuration as YAML, with all defaults. `load` reads an equal one."""
-        return dump.to_yaml(self.effective())
+        from holdfast.config.dump import to_yaml
+
+        return to_yaml(self.effective())
 
     def effective(self) -> dict[str, Any]:
         """The effective configuration as plain data, for YAML and JSON."""
+        from holdfast.config import dump
+
         return dump.effective(self.model_dump())
