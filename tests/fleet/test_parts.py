@@ -15,10 +15,11 @@ from nats.errors import TimeoutError as NoAnswer
 from holdfast.net.nats import batch
 from holdfast.net.nats.connection import Servers
 from holdfast.net.nats.outbox import Outbox
+from holdfast.replication.leases.bucket import Holding
 from holdfast.replication.leases.times import LeaseTimes
 from holdfast.scanner.errors import Moved, NotConfirmed, Refused
 from holdfast.scanner.fleet import desired_state, nodes, observer, questions
-from holdfast.scanner.fleet.agreement import Terms
+from holdfast.scanner.fleet.agreement import PROTOCOL, Terms, digest
 from holdfast.scanner.fleet.command_order import CommandOrder
 from holdfast.scanner.fleet.desired_state import DesiredDevice, DesiredState
 from holdfast.scanner.fleet.nodes import Executed, OtherNodes
@@ -43,6 +44,21 @@ TERMS = Terms(
     limits="",
     profiles="",
 )
+
+
+def test_messages_of_another_form_are_another_protocol() -> None:
+    """Nodes of two protocols refuse each other; otherwise, each must understand the other."""
+    between = (
+        *(nodes.Command, nodes.Executed, nodes.ReportQuestion, nodes.NodeReports),
+        *(DesiredDevice, Holding),
+    )
+    forms = [
+        (each.encode_name, str(each.type), each.required)
+        for kind in between
+        for each in msgspec.structs.fields(kind)
+    ]
+    found = digest(repr(forms).encode())
+    assert (PROTOCOL, found) == (2, "1a0b0247b8332a2d"), "must others be refused?"
 
 
 def test_a_message_with_the_revision_of_its_lease_has_a_header() -> None:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from holdfast.scanner.settings import FleetSettings, Settings
     from holdfast.tags import TagList
 
-PROTOCOL = 1
+PROTOCOL = 2
 """The version of the buckets and messages that nodes share."""
 
 
