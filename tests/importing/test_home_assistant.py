@@ -569,6 +569,17 @@ def test_each_unit_id_of_a_hub_is_a_device_with_its_own_interval(
     assert f"8: modbus[0].sensors[3]: {message}" in notes(found)
 
 
+def test_an_interval_longer_than_a_day_is_taken(imported: Callable[..., Imported]) -> None:
+    found = imported(
+        "sensors: [{name: a, address: 1, scan_interval: 604800}, "
+        "{name: b, address: 2, scan_interval: 99999999}]"
+    )
+    week, year = found.data["devices"].values()
+    assert (week["interval"], year["interval"]) == (604_800, 31_622_400)
+    message = "scan_interval: changed: polled every 31622400 s, the longest interval"
+    assert f"8: modbus[0].sensors[1].{message}" in notes(found)
+
+
 def test_a_serial_line_and_pauses_are_in_the_url(imported: Callable[..., Imported]) -> None:
     hub = (
         "- {name: line, type: serial, method: rtu, port: /dev/ttyUSB0, baudrate: 9600, "

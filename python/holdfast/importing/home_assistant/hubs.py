@@ -296,7 +296,10 @@ class _Hub:
             message = f"no slave: unit {UNIT}, as in newer versions; older ones asked 0"
             self.desk.check(entity.path, message)
         places = self.units.setdefault(UNIT if number is None else number, Places(self.desk))
-        interval = entity.integer("scan_interval", 0, 86_400, what="seconds")
+        interval = entity.integer("scan_interval", 0, 10**9, what="seconds")
+        if interval is not None and interval > MAX_TIME:
+            interval = int(MAX_TIME)
+            entity.changed("scan_interval", f"polled every {interval} s, the longest interval")
         known = len(places.tags)
         if entity.text("name", required=True) is not None:
             places.begin(entity, platform, SCAN_INTERVAL_S if interval is None else interval)
