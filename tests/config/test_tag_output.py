@@ -25,6 +25,8 @@ TAGS = [
     Tag("on", "coils", 3),
     Tag("voltage", "input_registers", 0, "float32", "CDAB", unit="V", description="a: b, c"),
     Tag("energy", "input_registers", 2, "uint32", "CDAB", scale=0.1, null=frozenset({0xFFFFFFFF})),
+    Tag("stock", "input_registers", 4, unit="kWh", device_class="energy_storage"),
+    Tag("water", "input_registers", 5, unit="m³", state_class="total_increasing"),
     Tag("name", "holding_registers", 10, "string:16"),
     Tag("mixed", "holding_registers", 40, "uint32", "ABCD", description='"quoted"'),
     Tag("raw", "holding_registers", 50, "uint16[3]", description="confidence 0.30: always 0"),

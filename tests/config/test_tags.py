@@ -71,6 +71,40 @@ def test_a_device_has_the_tags_of_its_profile_and_its_own(tmp_path: Path) -> Non
     assert load(written(tmp_path, config.dump(), "again.yaml")) == config
 
 
+def test_classes_that_home_assistant_would_not_take_have_a_warning(tmp_path: Path) -> None:
+    tags = (
+        "a: {area: coils, address: 0, device_class: door},"
+        "b: {area: coils, address: 0, device_class: energy},"
+        "c: {area: holding_registers, address: 0, unit: VAR, device_class: reactive_power},"
+        "d: {area: holding_registers, address: 0, unit: kVA, device_class: energy_storge},"
+        "e: {area: holding_registers, address: 0, unit: kVA, device_class: power_factor},"
+        "f: {area: holding_registers, address: 0, state_class: totals}"
+    )
+    written(tmp_path, f"tags: {{{tags}}}", "m.yaml")
+    devices = "".join(
+        f"  {name}: {{url: tcp://{name}, profile: m, interval: 1}}\n" for name in "xy"
+    )
+    warnings = load(written(tmp_path, f"profiles: [m.yaml]\ndevices:\n{devices}")).warnings
+    passed_on = "Home Assistant refuses an entity if it is unknown there"
+    assert [(each.key.rpartition("tags.")[2], each.message) for each in warnings] == [
+        ("b.device_class", "energy has no effect: it is no class of bits"),
+        (
+            "d.device_class",
+            f"'energy_storge' is unknown here: {passed_on}; did you mean 'energy_storage'?",
+        ),
+        (
+            "e.device_class",
+            "Home Assistant refuses power_factor with the unit 'kVA' over MQTT, allowed: %",
+        ),
+        ("f.state_class", f"'totals' is unknown here: {passed_on}; did you mean 'total'?"),
+    ]
+    text = DEVICE.replace("address: 1", "address: 1, device_class: power factor")
+    message = "found 'power factor', allowed: a word, such as energy_storage"
+    assert problems(written(tmp_path, text)) == [
+        f"p.yaml:1: devices.a.tags.x.device_class: {message}"
+    ]
+
+
 SCALED = """
   meter:
     tags:

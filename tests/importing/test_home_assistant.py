@@ -83,6 +83,7 @@ def test_a_sensor_becomes_a_tag(imported: Callable[..., Imported]) -> None:
                     "offset": -5,
                     "unit": "W",
                     "null": [4294967295],
+                    "device_class": "power",
                     "description": "Grid Power",
                 }
             },
@@ -93,10 +94,55 @@ def test_a_sensor_becomes_a_tag(imported: Callable[..., Imported]) -> None:
         "url": "mqtt://homeassistant.local",
         "discovery": "homeassistant",
     }
-    key = "modbus[0].sensors[0].device_class"
-    assert f"8: {key}: left out: it comes from the unit, if that has only one meaning" in notes(
-        found
+
+
+def classes(found: Imported) -> dict[str, tuple[str | None, str | None]]:
+    of = tags(found).items()
+    return {name: (tag.get("device_class"), tag.get("state_class")) for name, tag in of}
+
+
+def test_classes_are_those_of_the_source(imported: Callable[..., Imported]) -> None:
+    found = imported(
+        "sensors: [{name: stored, address: 1, unit_of_measurement: kWh, "
+        "device_class: ENERGY_STORAGE, state_class: measurement}, "
+        "{name: water, address: 2, unit_of_measurement: m³, device_class: water, "
+        "state_class: total_increasing, virtual_count: 1}, "
+        "{name: q, address: 4, unit_of_measurement: kVArh, device_class: reactive_energy}, "
+        "{name: newer, address: 5, device_class: of_later_version}]\n"
+        "    binary_sensors: [{name: door, address: 1, device_class: door}]\n"
+        "    switches: [{name: plug, address: 9, device_class: outlet}]"
     )
+    assert classes(found) == {
+        "stored": ("energy_storage", "measurement"),
+        "water": ("water", "total_increasing"),
+        "water_1": ("water", "total_increasing"),
+        "q": ("reactive_energy", None),
+        "newer": ("of_later_version", None),
+        "door": ("door", None),
+        "plug": ("outlet", None),
+    }
+    assert not [note for note in notes(found) if "_class" in note]
+
+
+def test_classes_with_which_no_entity_would_appear_are_left_out(
+    imported: Callable[..., Imported],
+) -> None:
+    found = imported(
+        "sensors: [{name: c, address: 1, unit_of_measurement: C, device_class: temperature}, "
+        "{name: text, address: 2, data_type: string, count: 2, state_class: measurement}, "
+        "{name: angle, address: 4, state_class: measurement_angle}, "
+        "{name: number, address: 5, device_class: 5}, "
+        "{name: words, address: 6, device_class: power factor}]"
+    )
+    assert set(classes(found).values()) == {(None, None)}
+    left_out = [note for note in notes(found) if "_class: left out: " in note]
+    assert [note.partition("left out: ")[2] for note in left_out] == [
+        "Home Assistant refuses temperature with the unit 'C' over MQTT, allowed: °C, °F or K",
+        "measurement has no effect: only numbers have a state class",
+        "Home Assistant refuses measurement_angle with the unit '' over MQTT, allowed: °",
+        "found 5, which is no class of Home Assistant",
+        "found 'power factor', which is no class of Home Assistant",
+    ]
 
 
 TYPES = {"int16": "h", "uint16": "H", "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q"}

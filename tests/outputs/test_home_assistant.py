@@ -111,6 +111,60 @@ def test_units_have_a_class_that_takes_them(unit: str) -> None:
     assert found(tag(unit=unit)).config.get("unit_of_measurement", "") == unit
 
 
+OUTLET = {"area": "coils", "type": "bool", "device_class": "outlet"}
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"unit": "kWh"}, ("energy", "total_increasing", "kWh")),
+        ({"unit": "kWh", "state_class": "total"}, ("energy", "total", "kWh")),
+        ({"unit": "kWh", "state_class": "measurement"}, (None, "measurement", "kWh")),
+        (
+            {"unit": "kWh", "device_class": "energy_storage"},
+            ("energy_storage", "measurement", "kWh"),
+        ),
+        ({"unit": "m³", "device_class": "water"}, ("water", "total_increasing", "m³")),
+        ({"unit": "%", "device_class": "battery"}, ("battery", "measurement", "%")),
+        (
+            {"unit": "°", "device_class": "wind_direction"},
+            ("wind_direction", "measurement_angle", "°"),
+        ),
+        ({"unit": "°C", "state_class": "total"}, (None, "total", "°C")),
+        (
+            {"unit": "h", "state_class": "total_increasing"},
+            ("duration", "total_increasing", "h"),
+        ),
+        ({"unit": "V", "device_class": "door"}, ("voltage", "measurement", "V")),
+        ({"unit": "kVAr"}, ("reactive_power", "measurement", "kvar")),
+        ({"unit": "kVArh"}, ("reactive_energy", "total_increasing", "kvarh")),
+        ({"unit": "m3/h"}, ("volume_flow_rate", "measurement", "m³/h")),
+        ({"unit": "Mvar"}, (None, "measurement", "Mvar")),
+        ({"type": "string:8", "device_class": "timestamp"}, ("timestamp", None, None)),
+        ({"type": "uint16", "states": STATES, "device_class": "power"}, ("enum", None, None)),
+        ({"type": "bit:3", "device_class": "door", "state_class": "total"}, ("door", None, None)),
+        (OUTLET, (None, None, None)),
+        (OUTLET | {"writable": True}, ("outlet", None, None)),
+        (OUTLET | {"writable": True, "device_class": "door"}, (None, None, None)),
+    ],
+)
+def test_the_classes_of_a_tag_are_those_of_its_entity(
+    given: dict[str, Any], expected: tuple[str | None, ...]
+) -> None:
+    """The parser refuses what Home Assistant would."""
+    config = found(tag(**given)).config
+    keys = ("device_class", "state_class", "unit_of_measurement")
+    assert tuple(config.get(key) for key in keys) == expected
+
+
+def test_a_class_of_a_later_version_is_passed_on() -> None:
+    made = Discovery("home", settings()).entities(
+        {"pump": [tag(unit="W", device_class="grid", state_class="peak")]}, {"pump": INFO}
+    )
+    [message] = [value for topic, value in made.items() if topic.endswith("--t/config")]
+    assert b'"device_class":"grid","state_class":"peak"' in message
+
+
 def test_without_writes_everything_is_read_only() -> None:
     for of, _ in COMPONENTS:
         assert "command_topic" not in found(of, writes=False).config
@@ -253,6 +307,17 @@ def test_a_reload_publishes_another_maker(plant: Plant) -> None:
     topic = "homeassistant/binary_sensor/holdfast_home/pump-connection/config"
     found = entity(topic, probe.next_of(topic).payload).config["device"]
     assert (found["manufacturer"], found["name"]) == ("Acme", "pump")
+
+
+def test_a_reload_publishes_another_class(plant: Plant) -> None:
+    plant.device()
+    probe = plant.probe("#")
+    appliance = plant.run(discovery="homeassistant")
+    probe.until("plant/holdfast/status/pump", "online")
+    valve = {**TAGS["valve"], "device_class": "opening"}
+    appliance.reload(plant.config({"discovery": "homeassistant"}, {**TAGS, "valve": valve}))
+    topic = "homeassistant/binary_sensor/holdfast_home/pump--valve/config"
+    assert b'"device_class":"opening"' in probe.next_of(topic).payload
 
 
 DIAGNOSTICS = 3

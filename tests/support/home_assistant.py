@@ -33,6 +33,7 @@ OWN: dict[str, dict[str, type | tuple[type, ...]]] = {
     "binary_sensor": {"device_class": str, "payload_on": str, "payload_off": str},
     "switch": {
         "command_topic": str,
+        "device_class": str,
         "payload_on": str,
         "payload_off": str,
         "state_on": str,
@@ -57,21 +58,29 @@ REQUIRED = {
     "number": {"command_topic"},
 }
 UNITS = {
-    "apparent_power": {"VA"},
+    "apparent_power": {"mVA", "VA", "kVA"},
+    "battery": {"%"},
+    "conductivity": {"µS/cm", "mS/cm", "S/cm"},
     "current": {"A", "mA"},
     "data_rate": {"bit/s", "kbit/s", "Mbit/s", "Gbit/s", "B/s", "kB/s", "MB/s", "GB/s"},
+    "distance": {"km", "m"},
+    "duration": {"d", "h", "min", "s", "ms"},
+    "energy_storage": {"kWh"},
     "energy": {"Wh", "kWh", "MWh", "GWh", "TWh", "mWh", "J", "kJ", "MJ", "GJ"},
     "frequency": {"Hz", "kHz", "MHz", "GHz"},
     "illuminance": {"lx"},
     "irradiance": {"W/m²"},
     "power": {"mW", "W", "kW", "MW", "GW", "TW"},
     "pressure": {"Pa", "hPa", "kPa", "bar", "cbar", "mbar", "mmHg", "inHg", "psi"},
-    "reactive_power": {"var"},
+    "reactive_energy": {"varh", "kvarh"},
+    "reactive_power": {"mvar", "var", "kvar"},
     "speed": {"m/s", "km/h", "mm/s", "mm/h", "mm/d"},
     "temperature": {"°C", "°F", "K"},
     "voltage": {"µV", "mV", "V", "kV", "MV"},
-    "volume_flow_rate": {"m³/h", "L/min", "mL/s"},
+    "volume_flow_rate": {"m³/h", "m³/s", "L/h", "L/min", "L/s", "mL/s"},
+    "water": {"m³", "L"},
     "weight": {"µg", "mg", "g", "kg"},
+    "wind_direction": {"°"},
 }
 """The units of each device class that outputs use."""
 
@@ -163,11 +172,20 @@ def _check_class(config: dict[str, Any], component: str) -> None:
         assert config["options"]
         return
     assert component == "select" or "options" not in config
-    if device_class == "connectivity":
-        assert component == "binary_sensor"
+    if component in ("binary_sensor", "switch"):
+        classes = {"binary_sensor": ("connectivity", "door"), "switch": ("outlet",)}
+        assert device_class is None or device_class in classes[component]
+        return
+    if device_class == "timestamp":
+        assert (component, unit, config.get("state_class")) == ("sensor", None, None)
         return
     if device_class is not None:
         assert unit in UNITS[device_class], f"{device_class} in {unit}"
     state_class = config.get("state_class")
-    assert state_class in (None, "measurement", "total", "total_increasing")
-    assert device_class != "energy" or state_class in (None, "total", "total_increasing")
+    known = (None, "measurement", "measurement_angle", "total", "total_increasing")
+    assert state_class in known
+    assert state_class != "measurement_angle" or unit == "°"
+    if device_class in ("energy", "reactive_energy", "water"):
+        assert state_class in (None, "total", "total_increasing")
+    if device_class == "energy_storage":
+        assert state_class in (None, "measurement")

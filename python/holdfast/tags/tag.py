@@ -70,6 +70,10 @@ class Tag(WritableTag):
     round: Rounding | None = None
     """What happens to a value between two steps; `None`: whoever writes decides."""
     description: str = ""
+    device_class: str = ""
+    """What it is for Home Assistant, such as `energy_storage`. Empty: what its unit suggests."""
+    state_class: str = ""
+    """How Home Assistant keeps statistics of it, such as `total`. Empty: by its device class."""
 
     def __post_init__(self) -> None:
         if self.area not in AREAS:

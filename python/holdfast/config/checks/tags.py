@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from holdfast.config.checks.common import Scope, check_name, items, until_invalid
 from holdfast.config.models.base import InvalidValue
+from holdfast.config.values.home_assistant_classes import flaws as class_flaws
 from holdfast.protocol import READ_REGISTERS
 from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import extent
@@ -74,7 +75,9 @@ def _tags(scope: Scope, path: KeyPath, tags: Mapping[str, TagConfig], order: str
         name = str(where[-1])
         with until_invalid():
             try:
-                found[name] = settings.tag(name, order)
+                found[name] = tag = settings.tag(name, order)
+                for key, flaw in class_flaws(tag):
+                    scope.report.warn((*where, key), flaw)
             except (TagError, InvalidValue):
                 for error in settings.flaws(name, order):
                     at = (*where, error.key)

@@ -14,6 +14,7 @@ from pydantic.json_schema import WithJsonSchema
 from holdfast.config.models.base import INVALID, InvalidValue, Model
 from holdfast.config.models.memories import Register
 from holdfast.config.text.messages import show
+from holdfast.config.values.home_assistant_classes import is_class_word
 from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, Number, check_state_name
 from holdfast.config.values.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
 from holdfast.tags import Tag, TagError, TagList
@@ -53,6 +54,13 @@ def _one_line(value: str) -> str:
     return value
 
 
+def _class_word(value: str) -> str:
+    if value and not is_class_word(value):
+        raise ValueError(f"found {show(value)}, allowed: a word, such as energy_storage")
+    return value
+
+
+ClassWord = Annotated[str, AfterValidator(_class_word)]
 _INTEGER_KEYS: JsonDict = {"propertyNames": {"pattern": "^-?[0-9]+$"}}
 
 
@@ -92,6 +100,11 @@ class TagConfig(Model):
     """What happens to a value between two steps. Default: exact for writes, nearest in mqtt.map."""
     description: str = ""
     """A description, for people."""
+    device_class: ClassWord = ""
+    """What it is for Home Assistant, such as energy_storage. Default: what its unit suggests."""
+    state_class: ClassWord = ""
+    """How Home Assistant keeps statistics of it: measurement, measurement_angle, total or
+    total_increasing. Default: by its device class."""
 
     def tag(self, name: str, order: str) -> Tag:
         """The tag, with a default order. Raises `TagError`."""

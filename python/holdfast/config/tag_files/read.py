@@ -39,12 +39,18 @@ COLUMNS = (
     *("scale", "offset", "unit", "writable", "description"),
 )
 """The columns of CSV, in this order if the file does not name them."""
-MORE_COLUMNS = ("min", "max", "deadband", "round", "encoding", "null")
+MORE_COLUMNS = (
+    *("min", "max", "deadband", "round", "encoding", "null"),
+    *("device_class", "state_class"),
+)
 """Columns that a file can have if it names its columns."""
 
 _NUMBERS = ("scale", "offset", "min", "max", "deadband", "null")
 
-_TEXT = ("name", "type", "order", "unit", "description", "encoding", "round")
+_TEXT = (
+    *("name", "type", "order", "unit", "description", "encoding", "round"),
+    *("device_class", "state_class"),
+)
 
 
 def load_tags(path: Path | str) -> TagList:

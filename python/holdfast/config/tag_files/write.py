@@ -18,7 +18,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 
-_PLAIN = ("encoding", "scale", "offset", "unit", "writable", "min", "max", "deadband", "round")
+_PLAIN = (
+    *("encoding", "scale", "offset", "unit", "writable", "min", "max", "deadband", "round"),
+    *("device_class", "state_class"),
+)
 """Keys that are written if they are not the default."""
 
 

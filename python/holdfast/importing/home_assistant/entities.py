@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from holdfast.config.text.messages import show
+from holdfast.config.values.home_assistant_classes import KNOWN, flaws, is_class_word
 from holdfast.config.values.scalars import check_state_name
 from holdfast.importing.key_reader import Section
 from holdfast.importing.names import MAX_LENGTH
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS
+from holdfast.tags import Tag
 from holdfast.values import encode, register_count
 from holdfast.values.digits import FLOATS
 from holdfast.values.errors import DoesNotFit
@@ -186,6 +188,7 @@ def _sensor(places: Places, entity: Section) -> None:
     settings |= {"type": found.element, **scaled}
     settings["unit"] = entity.text("unit_of_measurement")
     settings["null"] = _null(entity, found.element)
+    settings |= _classes(entity, area, type=found.element, unit=settings["unit"] or "")
     size = register_count(found.element)
     for index in range((_copies(entity) + 1) * (found.count or 1)):
         name = f"{_name(entity)} {index}" if index else _name(entity)
@@ -206,6 +209,23 @@ def _number(places: Places, entity: Section) -> None:
             each.tag["round"] = "nearest"
         if register_count(each.tag["type"]) == 1:
             places.written[is_multiple].append(entity.path)
+
+
+def _classes(entity: Section, area: Area, **settings: Any) -> dict[str, Any]:
+    """The classes of an entity, but for those that its tag can't have."""
+    classes: dict[str, Any] = {}
+    for key in KNOWN:
+        given = entity.get(key)
+        word = given.strip().lower() if isinstance(given, str) else ""
+        if is_class_word(word):
+            classes[key] = word
+        elif given is not None:
+            entity.left_out(key, f"found {show(given)}, which is no class of Home Assistant")
+    for key, flaw in list(flaws(Tag("tag", area, 0, **settings, **classes))):
+        if classes[key] in KNOWN[key]:
+            entity.left_out(key, flaw)
+            del classes[key]
+    return classes
 
 
 def _copies(entity: Section) -> int:
@@ -343,9 +363,10 @@ def _binary_sensor(places: Places, entity: Section) -> None:
     address = _address(entity)
     if address is None:
         return
+    settings = {} if area in _BITS else {"type": "bit:0"}
+    settings |= _classes(entity, area, **settings)
     for index in range(_copies(entity) + 1):
         name = f"{_name(entity)} {index}" if index else _name(entity)
-        settings = {} if area in _BITS else {"type": "bit:0"}
         places.add(name, area, address + index, **settings)
 
 
@@ -362,7 +383,8 @@ def _switch(places: Places, entity: Section) -> None:
     if settings is None:
         return
     places.written[entity.get("write_type") in ("holdings", "coils")].append(entity.path)
-    places.add(_name(entity), area, address, **settings, writable=True)
+    classes = _classes(entity, area, **settings)
+    places.add(_name(entity), area, address, **settings, **classes, writable=True)
     if "verify" not in entity.data:
         message = "its state is read from its address; the source did not read it"
         entity.desk.check(entity.path, message)

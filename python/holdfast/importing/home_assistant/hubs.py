@@ -47,7 +47,7 @@ _HUB_REASONS = {
 _ENTITY_REASONS = {
     "brightness_address": "brightness is not converted: add a tag",
     "color_temp_address": "color temperatures are not converted: add a tag",
-    "device_class": "it comes from the unit, if that has only one meaning",
+    "device_class": "what it becomes has none",
     "lazy_error_count": "an entity is unavailable while its device does not answer",
     "max_temp": "the limits of color temperatures are not converted",
     "max_value": "values are not limited",
@@ -55,7 +55,6 @@ _ENTITY_REASONS = {
     "min_value": "values are not limited",
     "precision": "values are not rounded; Home Assistant can show fewer digits",
     "step": "the step is the scale",
-    "state_class": "numbers are measurements, and energies totals",
     "temp_step": "the step is the scale",
     "unique_id": "the new entities have ids of their own",
     "zero_suppress": "small values are not replaced by 0",

@@ -1,6 +1,6 @@
 """Discovery messages for Home Assistant: one device for each device, one entity for each tag.
 
-Units that stand for several quantities, such as % and m³, have no device class.
+A device class is that of the tag, or what its unit suggests: % and m³, for example, suggest none.
 Each device also has diagnostic entities, and all are behind one device for the output.
 """
 
@@ -11,48 +11,26 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from holdfast._core import __version__
+from holdfast.config.values.home_assistant_classes import (
+    BINARY_SENSORS,
+    SWITCHES,
+    TEXTS,
+    is_on_or_off,
+    of_number,
+    spelled,
+    takes,
+)
 from holdfast.net.addresses import address_in
 from holdfast.tags.scale import RegisterScale, linear_of
 from holdfast.tags.text import text_of
 from holdfast.values.numeric import limits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping, Sequence
 
     from holdfast.config.models.outputs import MqttOutputConfig
     from holdfast.outputs.device_access import DeviceInfo
     from holdfast.tags import Tag
-
-MEASUREMENT, TOTAL = "measurement", "total_increasing"
-
-_DEVICE_CLASSES = {
-    "apparent_power": ("VA",),
-    "current": ("A", "mA"),
-    "data_rate": ("bit/s", "kbit/s", "Mbit/s"),
-    "energy": ("Wh", "kWh", "MWh", "GWh", "J", "kJ", "MJ", "GJ"),
-    "frequency": ("Hz", "kHz", "MHz", "GHz"),
-    "illuminance": ("lx",),
-    "irradiance": ("W/m²",),
-    "power": ("W", "kW", "MW", "GW"),
-    "pressure": ("Pa", "hPa", "kPa", "bar", "mbar", "psi"),
-    "reactive_power": ("var",),
-    "speed": ("m/s", "km/h", "mm/s"),
-    "temperature": ("°C", "°F", "K"),
-    "voltage": ("V", "mV", "kV"),
-    "volume_flow_rate": ("m³/h", "L/min"),
-    "weight": ("kg", "g"),
-}
-_OF_UNIT = {unit: name for name, units in _DEVICE_CLASSES.items() for unit in units}
-
-
-def classes(unit: str) -> tuple[str | None, str]:
-    """The device class and the state class of a unit.
-
-    Energy is what a meter counts: it only falls when the meter begins again.
-    """
-    device_class = _OF_UNIT.get(unit)
-    return device_class, TOTAL if device_class == "energy" else MEASUREMENT
-
 
 MIN_STEP = 0.001
 """The smallest step that Home Assistant accepts."""
@@ -196,25 +174,27 @@ class Discovery:
         # Commands are refused for tags whose scale is in a register.
         writes = self._settings.writes and tag.writable and tag.source is None
         command = {"command_topic": self._names.of_commands(device, tag.name)} if writes else {}
-        is_on_or_off = set(tag.states.values()) == {"on", "off"}
-        if is_on_or_off or tag.of_type.base in ("bool", "bit"):
-            on, off = ("on", "off") if is_on_or_off else (text_of(tag, True), text_of(tag, False))
+        if is_on_or_off(tag):
+            on, off = ("on", "off")
+            if set(tag.states.values()) != {on, off}:
+                on, off = text_of(tag, True), text_of(tag, False)
             if off == "on":  # A relay that is on at 0: Home Assistant has no names, only on.
                 on, off = off, on
+            shown = {"payload_on": on, "payload_off": off}
             if not writes:
-                return "binary_sensor", {"payload_on": on, "payload_off": off}
-            states = {"state_on": on, "state_off": off}
-            return "switch", {"payload_on": on, "payload_off": off, **states, **command}
+                return "binary_sensor", shown | _device_class(tag, BINARY_SENSORS)
+            shown |= {"state_on": on, "state_off": off}
+            return "switch", shown | command | _device_class(tag, SWITCHES)
         if tag.states:
             options = list(tag.states.values())
             if writes:
                 return "select", {"options": options, **command}
             return "sensor", {"device_class": "enum", "options": options}
         if not tag.is_number:
-            return "sensor", {}
-        device_class, state_class = classes(tag.unit)
-        own = {"unit_of_measurement": tag.unit} if tag.unit else {}
-        if device_class is not None:
+            return "sensor", _device_class(tag, TEXTS)
+        device_class, state_class = of_number(tag)
+        own = {"unit_of_measurement": spelled(tag.unit)} if tag.unit else {}
+        if device_class:
             own["device_class"] = device_class
         if writes and (bounds := _bounds(tag))["min"] < bounds["max"]:
             return "number", {**own, **bounds, "mode": "box", **command}
@@ -244,6 +224,12 @@ class Discovery:
         else:
             found = f"{found} if {found} is not none{_within(own, found)} else '{NONE}'"
         return {"state_topic": topic, "value_template": f"{{{{ {found} }}}}"}
+
+
+def _device_class(tag: Tag, known: Collection[str]) -> dict[str, str]:
+    """The class that a tag names, if its entity, whose classes are `known`, can have it."""
+    is_given = tag.device_class and takes(known, tag.device_class)
+    return {"device_class": tag.device_class} if is_given else {}
 
 
 def _bounds(tag: Tag) -> dict[str, float]:
