@@ -137,7 +137,7 @@ OUTLET = {"area": "coils", "type": "bool", "device_class": "outlet"}
         ),
         ({"unit": "V", "device_class": "door"}, ("voltage", "measurement", "V")),
         ({"unit": "kVAr"}, ("reactive_power", "measurement", "kvar")),
-        ({"unit": "kVArh"}, ("reactive_energy", "total_increasing", "kvarh")),
+        ({"unit": "kVArh"}, (None, "measurement", "kvarh")),
         ({"unit": "m3/h"}, ("volume_flow_rate", "measurement", "m³/h")),
         ({"unit": "Mvar"}, (None, "measurement", "Mvar")),
         ({"type": "string:8", "device_class": "timestamp"}, ("timestamp", None, None)),

@@ -32,8 +32,6 @@ _WIND = ("m/s", "km/h", "mm/s", "m/min", "in/s", "ft/s", "mph", "kn", "Beaufort"
 
 _GENERAL = {
     "apparent_power": ("mVA", "VA", "kVA"),
-    "area": ("mm²", "cm²", "m²", "km²", "ha", "in²", "ft²", "yd²", "ac", "mi²"),
-    "conductivity": ("µS/cm", "mS/cm", "S/cm"),
     "current": ("mA", "A"),
     "data_rate": (
         *("bit/s", "kbit/s", "Mbit/s", "Gbit/s", "B/s", "kB/s", "MB/s", "GB/s"),
@@ -42,7 +40,6 @@ _GENERAL = {
     "distance": ("mm", "cm", "m", "km", "in", "ft", "yd", "mi", "nmi"),
     "duration": ("µs", "ms", "s", "min", "h", "d"),
     "energy": _ENERGY,
-    "energy_distance": ("Wh/km", "kWh/100km", "km/kWh", "mi/kWh"),
     "frequency": ("Hz", "kHz", "MHz", "GHz"),
     "illuminance": ("lx",),
     "irradiance": ("W/m²", "BTU/(h⋅ft²)"),
@@ -50,7 +47,6 @@ _GENERAL = {
     "precipitation": ("mm", "cm", "in"),
     "precipitation_intensity": _RAIN,
     "pressure": _PRESSURE,
-    "reactive_energy": ("varh", "kvarh"),
     "reactive_power": ("mvar", "var", "kvar"),
     "signal_strength": ("dB", "dBm"),
     "sound_pressure": ("dB", "dBA"),
@@ -69,15 +65,18 @@ _DATA = ("B", "kB", "MB", "GB", "TB", "PB", "EB", "ZB", "YB")
 _PARTICULAR: dict[str, tuple[str, ...]] = {
     "absolute_humidity": ("mg/m³", "g/m³"),
     "aqi": (),
+    "area": ("mm²", "cm²", "m²", "km²", "ha", "in²", "ft²", "yd²", "ac", "mi²"),
     "atmospheric_pressure": _PRESSURE,
     "battery": ("%",),
     "blood_glucose_concentration": ("mg/dL", "mmol/L"),
     "carbon_dioxide": ("ppm",),
     "carbon_monoxide": ("ppb", "ppm", "µg/m³", "mg/m³"),
+    "conductivity": ("µS/cm", "mS/cm", "S/cm"),
     "data_size": (
         *("bit", "kbit", "Mbit", "Gbit", *_DATA),
         *("KiB", "MiB", "GiB", "TiB", "PiB", "EiB", "ZiB", "YiB"),
     ),
+    "energy_distance": ("Wh/km", "kWh/100km", "km/kWh", "mi/kWh"),
     "energy_storage": _ENERGY,
     "gas": _VOLUME,
     "humidity": ("%",),
@@ -92,6 +91,7 @@ _PARTICULAR: dict[str, tuple[str, ...]] = {
     "pm25": ("µg/m³",),
     "pm4": ("µg/m³",),
     "power_factor": ("%",),
+    "reactive_energy": ("varh", "kvarh"),
     "sulphur_dioxide": ("ppb", "µg/m³"),
     "temperature_delta": _TEMPERATURE,
     "volatile_organic_compounds": ("µg/m³", "mg/m³"),
@@ -102,7 +102,8 @@ _PARTICULAR: dict[str, tuple[str, ...]] = {
     "wind_direction": ("°",),
     "wind_speed": _WIND,
 }
-"""Those that a tag must name, with their units."""
+"""Those that a tag must name, with their units: a unit can mean another, or only newer versions of
+Home Assistant know the class, and others refuse the entity."""
 
 _UNITS = _GENERAL | _PARTICULAR
 NUMBERS = frozenset(_UNITS) | {"monetary"}
