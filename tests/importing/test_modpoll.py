@@ -125,6 +125,14 @@ def test_a_device_is_polled_as_before(read: Callable[[str], Imported]) -> None:
     assert device["tags"]["my_power"] == {**area, "address": 23, "type": "uint16", "unit": "kW"}
 
 
+def test_a_tag_that_is_renamed_has_its_name_as_description(
+    read: Callable[[str], Imported],
+) -> None:
+    text = "device,plant,1\npoll,coil,0,32,BE_BE\nref,Größe L1 °C,0,bool8,r\n"
+    tags = read(text).data["devices"]["plant"]["tags"]
+    assert (min(tags), tags[min(tags)]["description"]) == ("Gr__e_L1__C_0", "Größe_L1_°C_0")
+
+
 @pytest.mark.parametrize(
     ("order", "expected"),
     [

@@ -17,7 +17,7 @@ from holdfast.config.text import yaml_document
 from holdfast.config.text.messages import show
 from holdfast.config.text.problems import ConfigError, Problem
 from holdfast.importing.imported import Imported, NotImportable
-from holdfast.importing.names import free_name, unique_names
+from holdfast.importing.names import free_name, named_tags, unique_names
 from holdfast.importing.notes import Desk
 from holdfast.importing.source_requests import read_settings
 from holdfast.protocol import ADDRESSES, MAX_UNIT, WRITE_LIMITS
@@ -160,9 +160,10 @@ class _Device:
     tags: list[tuple[KeyPath, str, dict[str, Any]]] = field(default_factory=list)
 
     def settings(self, desk: Desk) -> dict[str, Any]:
-        """The tags by name, and how they are read."""
-        names = unique_names(desk, [(path, name) for path, name, _ in self.tags])
-        tags = {name: tag for name, (_, _, tag) in zip(names, self.tags, strict=True)}
+        """The tags by name, and how they are read; a renamed one has its reference's name as
+        description.
+        """
+        tags = named_tags(desk, self.tags)
         requests = [(each.area, range(each.start, each.end)) for each in self.polls]
         return {**read_settings(requests, tags.values()), "tags": tags}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from holdfast.config.values.scalars import NAME_FORM
 
@@ -38,6 +38,17 @@ def unique_names(
             desk.changed(path, f"renamed to {name}: {reason}")
         given.append(name)
     return given
+
+
+def named_tags(
+    desk: Desk, wanted: Sequence[tuple[KeyPath, str, dict[str, Any]]]
+) -> dict[str, dict[str, Any]]:
+    """The tags by unique, allowed names; one that is renamed has the wanted name as description."""
+    names = unique_names(desk, [(path, text) for path, text, _ in wanted])
+    return {
+        name: tag if name == text else {**tag, "description": text}
+        for name, (_, text, tag) in zip(names, wanted, strict=True)
+    }
 
 
 def _allowed(text: str) -> str:

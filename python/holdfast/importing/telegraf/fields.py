@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from holdfast.importing.names import unique_names
+from holdfast.importing.names import named_tags
 from holdfast.importing.source_requests import Request, joined, read_settings
 from holdfast.protocol import ADDRESSES, LAST_ADDRESS, MAX_UNIT
 from holdfast.runtime.text import listing
@@ -151,11 +151,7 @@ class Unit:
         """How these fields are read, and their tags by name; a renamed one has the name of its
         field as description. `limits` are those that the source names.
         """
-        names = unique_names(desk, [(each.path, each.name) for each in fields])
-        tags = {
-            name: each.tag if name == each.name else {**each.tag, "description": each.name}
-            for name, each in zip(names, fields, strict=True)
-        }
+        tags = named_tags(desk, [(each.path, each.name, each.tag) for each in fields])
         return {**read_settings(self.requests, tags.values()), **limits, "tags": tags}
 
 
