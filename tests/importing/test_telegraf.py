@@ -602,6 +602,17 @@ def test_a_field_of_one_byte_is_left_out(imported: Callable[[str], Imported], ki
     ]
 
 
+def test_a_float32_at_one_address_is_the_fixed_number_of_older_versions(
+    imported: Callable[[str], Imported],
+) -> None:
+    found = imported(changed('"FIXED"', '"FLOAT32"'))
+    assert device(found)["tags"] == device(imported(changed('"FIXED"', '"UFIXED"')))["tags"]
+    assert notes(found) == [
+        "10: inputs.modbus[0].holding_registers[0].data_type: check: FLOAT32 at one address: "
+        "UFIXED, as until Telegraf 1.36"
+    ]
+
+
 def test_text_in_half_of_each_register_is_left_out(imported: Callable[[str], Imported]) -> None:
     text = changed('"FIXED", scale=0.1', '"STRING"')
     text += '  [inputs.modbus.workarounds]\n    string_register_location = "lower"\n'

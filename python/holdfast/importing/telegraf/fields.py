@@ -211,15 +211,19 @@ class Fields:
             self._add(unit, entry, name, addresses, area, found, [entry])
             entry.close(_BIT_REASONS)
             return
-        kind = self._data_type(entry)
+        kind = self._data_type(entry, addresses)
         order = entry.word("byte_order", tuple(_ORDERS_OF_REGISTERS), required=True)
         if kind is not None and addresses and order is not None:
             found = self._of_registers(entry, kind, len(addresses), order)
         self._add(unit, entry, name, addresses, area, found, [entry])
         entry.close({"bit": "Telegraf used it for BIT only"})
 
-    def _data_type(self, entry: Section) -> str | None:
+    def _data_type(self, entry: Section, addresses: range | None) -> str | None:
         if entry.get("data_type") == "FLOAT32":
+            if addresses is not None and len(addresses) == 1:
+                # An IEEE float has two registers: Telegraf fails with it since 1.37.
+                entry.check("data_type", "FLOAT32 at one address: UFIXED, as until Telegraf 1.36")
+                return "UFIXED"
             message = "found FLOAT32, unsigned integers until Telegraf 1.36 and IEEE floats since"
             allowed = "allowed: UFIXED or FLOAT32-IEEE"
             entry.problem("data_type", f"{message}, {allowed}")
