@@ -46,6 +46,7 @@ CASES = {
     "memory verify": ("{folder}/plant.redb", "{mma}"),
     "import home-assistant": ("{home_assistant}", "{absent}"),
     "import mma": ("{mma}", "{absent}"),
+    "import modbus-proxy": ("{modbus_proxy}", "{absent}"),
     "import modpoll": ("{modpoll} --url tcp://10.5.1.29", "{absent} --url tcp://10.5.1.29"),
     "import replicator": ("{replicator}", "{absent}"),
     "import telegraf": ("{telegraf}", "{absent}"),
@@ -76,6 +77,8 @@ TELEGRAF = """\
   controller = "tcp://10.5.1.29:502"
   coils = [{name = "pump", address = [0]}]
 """
+
+MODBUS_PROXY = "devices: [{modbus: {url: '10.5.1.29:502'}, listen: {bind: '127.0.0.1:9000'}}]\n"
 
 MODPOLL = "device,plc,1\npoll,coil,0,8,BE_BE\nref,pump,0,bool,r\n"
 
@@ -150,6 +153,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
     (folder / "replicator.yaml").write_text(REPLICATOR)
     (folder / "home_assistant.yaml").write_text(HOME_ASSISTANT)
     (folder / "telegraf.conf").write_text(TELEGRAF)
+    (folder / "modbus_proxy.yaml").write_text(MODBUS_PROXY)
     (folder / "modpoll.csv").write_text(MODPOLL)
     yield {
         "mma": str(DATA / "mma" / "plant.yaml"),
@@ -159,6 +163,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
         "replicator": str(folder / "replicator.yaml"),
         "home_assistant": str(folder / "home_assistant.yaml"),
         "telegraf": str(folder / "telegraf.conf"),
+        "modbus_proxy": str(folder / "modbus_proxy.yaml"),
         "modpoll": str(folder / "modpoll.csv"),
         "audit": str(folder / "audit.log"),
         "nats": nats.url,

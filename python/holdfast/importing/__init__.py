@@ -9,6 +9,7 @@ from __future__ import annotations
 from holdfast.importing.home_assistant.hubs import read_home_assistant
 from holdfast.importing.imported import ORDINALS, Imported, NotImportable
 from holdfast.importing.mma.configuration import read_mma
+from holdfast.importing.modbus_proxy import read_modbus_proxy
 from holdfast.importing.modpoll import INTERVAL_S, read_modpoll
 from holdfast.importing.notes import Kind, Note
 from holdfast.importing.replicator import read_replicator
@@ -23,6 +24,7 @@ __all__ = [
     "Note",
     "read_home_assistant",
     "read_mma",
+    "read_modbus_proxy",
     "read_modpoll",
     "read_replicator",
     "read_telegraf",

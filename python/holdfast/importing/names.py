@@ -24,13 +24,13 @@ def unique_names(
     `reserved` are names that none may have.
     """
     texts = [text for _, text in wanted]
-    kept = {text for text in texts if _allowed(text) == text}.difference(reserved)
+    kept = {text for text in texts if allowed_name(text) == text}.difference(reserved)
     taken = kept.union(reserved)
     given: list[str] = []
     for index, (path, text) in enumerate(wanted):
         name = text
         if text not in kept or text in texts[:index]:
-            name = free_name(_allowed(text), taken)
+            name = free_name(allowed_name(text), taken)
             taken.add(name)
             reason = "the name is in use" if text in texts[:index] else f"a name has {NAME_FORM}"
             if text in reserved:
@@ -51,7 +51,8 @@ def named_tags(
     }
 
 
-def _allowed(text: str) -> str:
+def allowed_name(text: str) -> str:
+    """The name that a configuration allows and that is most like a text."""
     return re.sub(r"[^A-Za-z0-9_.-]", "_", text)[:MAX_LENGTH] or "_"
 
 

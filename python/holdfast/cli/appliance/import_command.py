@@ -32,6 +32,7 @@ from holdfast.importing import (
     NotImportable,
     read_home_assistant,
     read_mma,
+    read_modbus_proxy,
     read_modpoll,
     read_replicator,
     read_telegraf,
@@ -156,6 +157,20 @@ def modpoll(task: _Task, url: str, interval: float) -> None:
     OUT, 2 can't import FILE.
     """
     task.convert(lambda file: read_modpoll(file, url, interval))
+
+
+@import_.command(
+    "modbus-proxy", epilog="Example: holdfast import modbus-proxy devices.yaml --output plant.yaml"
+)
+@_task
+def modbus_proxy(task: _Task) -> None:
+    """Convert FILE, a configuration of modbus-proxy, to a Holdfast configuration.
+
+    FILE is YAML, JSON or TOML. Prints the new configuration, with a link and a listener for each
+    device. Notes on standard error, and comments in the configuration, say what was not converted,
+    what was changed and what to check. Exit codes: 0 done, 1 can't write OUT, 2 can't import FILE.
+    """
+    task.convert(read_modbus_proxy)
 
 
 @import_.command(epilog="Example: holdfast import replicator replicator.yaml --output mirror.yaml")

@@ -27,7 +27,7 @@ from holdfast.importing.telegraf.fields import MEASUREMENT, Field
 from holdfast.importing.telegraf.influx import Influx
 from holdfast.importing.telegraf.inputs import INTERVAL_S, Device, InputReader, share_connections
 from holdfast.importing.telegraf.reasons import LOGGED, NO_COUNTERPART
-from holdfast.importing.telegraf.toml_document import VARIABLE, document
+from holdfast.importing.toml_document import VARIABLE, document
 from holdfast.runtime.text import listing
 
 if TYPE_CHECKING:
