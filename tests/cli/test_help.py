@@ -48,6 +48,10 @@ def test_the_help_imports_no_command() -> None:
         (("describe", "plc"), "'plc' is not the URL of a device"),
         (("replicsa",), "Did you mean 'log status' or 'log replay'?"),
         (("import", "mmaa"), "No such command 'mmaa'. Did you mean 'mma'?"),
+        (
+            ("import", "evcc"),
+            "No such command 'evcc'. See docs/replacing.md, which has tables for other programs.",
+        ),
         (("xyzzy",), "No such command 'xyzzy'."),
         (("tcp://plc",), "Did you mean 'holdfast read tcp://plc'?"),
         (("read", "tcp://plc", "hr", "0", "--jsn"), "'--json'?)"),

@@ -511,6 +511,18 @@ def test_initial_values_from_yaml_are_checked(folder: Folder, values: str, probl
         ("", f"1: found an empty file, allowed: a mapping with the keys {TOP}"),
         ("# nothing\n", f"1: found an empty file, allowed: a mapping with the keys {TOP}"),
         ("[]", f"1: found an empty list, allowed: a mapping with the keys {TOP}"),
+        ("[agent]\n  [[inputs.modbus]]\n  name = 'm'\n",
+         "2: found a configuration of Telegraf, allowed: one of Holdfast; to convert it: holdfast "
+         "import telegraf FILE"),
+        ("device,m,1\npoll,coil,0,8,BE_BE\nref,a,0,bool,r\n",
+         "2: found a configuration of modpoll, allowed: one of Holdfast; to convert it: holdfast "
+         "import modpoll FILE --url URL"),
+        ("# all\r\ndevices:\r\n  # one\r\n  - modbus: {url: 'm:502'}\r\n    listen: {bind: '0:9'}",
+         "2: found a configuration of modbus-proxy, allowed: one of Holdfast; to convert it: "
+         "holdfast import modbus-proxy FILE"),
+        ("mqtt: !secret a\nmodbus:\n  - {name: m, type: tcp, host: m, port: 502}\n",
+         "2: found a configuration of Home Assistant, allowed: one of Holdfast; to convert it: "
+         "holdfast import home-assistant FILE"),
         ("root:x:0:0:root\n",
          f"1: found text of 15 characters, allowed: a mapping with the keys {TOP}"),
         ("root:*:1::\ndaemon:*:2::\n",

@@ -97,6 +97,8 @@ class SuggestingGroup(click.Group):
     """A group whose error for an unknown command says what was probably meant."""
 
     old_names: Mapping[str, str] = {}
+    page = ""
+    """The page to read if nothing like an unknown command is known."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -107,7 +109,8 @@ class SuggestingGroup(click.Group):
         # A shell that completes a line shows no errors.
         if name not in known and not name.startswith("-") and not ctx.resilient_parsing:
             typed = {**{each: each for each in known}, **self.old_names}
-            ctx.fail(f"No such command {name!r}.{_suggestion(name, typed)}")
+            see = self.page and f" See {self.page}."
+            ctx.fail(f"No such command {name!r}.{_suggestion(name, typed) or see}")
         return super().resolve_command(ctx, args)
 
 

@@ -7,6 +7,7 @@ models that are valid, so an error in one does not hide an error in the other.
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 
 from holdfast.config.allowed_words import allowed, known_keys
@@ -39,6 +40,18 @@ from holdfast.config.text.templates import expand_templates
 from holdfast.runtime import bounded_files
 from holdfast.runtime.suggestion import HIGH_LIKENESS, alike
 
+_ITEM = r"\s*(?:#.*\n\s*)*-\s+"
+"""What is between a key and the first entry of the list that is its value."""
+
+_OTHER_PROGRAMS = {
+    ("Telegraf", "telegraf FILE"): r"^[ \t]*\[\[ *inputs\.modbus *\]\]",
+    ("modpoll", "modpoll FILE --url URL"): r"^poll, *(?:coil|discrete_input|\w+_register) *,",
+    ("modbus-proxy", "modbus-proxy FILE"): rf"^devices:{_ITEM}(?:modbus|listen):",
+    ("Home Assistant", "home-assistant FILE"): rf"^modbus:(?:{_ITEM}| +!include)",
+}
+"""What is only in configurations of other programs, by the program and what `holdfast import`
+takes."""
+
 
 def load(path: Path | str) -> Config:
     """Reads a configuration. Raises `ConfigError` with every problem.
@@ -54,8 +67,15 @@ def loaded(path: Path | str) -> tuple[Config, yaml_document.Document]:
 
     def work() -> tuple[Config, yaml_document.Document]:
         content = yaml_document.read_bytes(Path(path), file)
-        document, problems = yaml_document.parse(yaml_document.decoded(content, file), file)
-        config = checked(document, problems, Path(path).absolute().parent)
+        text = yaml_document.decoded(content, file)
+        try:
+            document, problems = yaml_document.parse(text, file)
+            config = checked(document, problems, Path(path).absolute().parent)
+        except ConfigNotAnswered:
+            raise
+        except ConfigError:
+            _refuse_other_program(text, file)
+            raise
         config.set_sha256(hashlib.sha256(content).hexdigest())
         return config, document
 
@@ -118,6 +138,18 @@ def _warn(scope: Scope) -> None:
     warn_of_outputs(scope)
     warn_of_grants(scope)
     warn_of_routes(scope)
+
+
+def _refuse_other_program(text: str, file: str) -> None:
+    """Raises `ConfigError` if the text, which is not valid, is a configuration of another program
+    that can be imported.
+    """
+    for (program, arguments), pattern in _OTHER_PROGRAMS.items():
+        if found := re.search(pattern, text, re.MULTILINE):
+            line = text.count("\n", 0, found.start()) + 1
+            message = f"found a configuration of {program}, allowed: one of Holdfast"
+            hint = f"to convert it: holdfast import {arguments}"
+            raise ConfigError(file, [Problem(file, line, 1, "", f"{message}; {hint}")]) from None
 
 
 def _foreign(data: object) -> str | None:

@@ -85,9 +85,13 @@ _task = option_group(
 """Adds the argument and the options of all imports: the argument `task`."""
 
 
+class _Programs(SuggestingGroup):
+    page = "docs/replacing.md, which has tables for other programs"
+
+
 @click.group(
     "import",
-    cls=SuggestingGroup,
+    cls=_Programs,
     epilog="Example: holdfast import mma config.yaml --output plant.yaml",
 )
 def import_() -> None:
