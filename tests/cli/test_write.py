@@ -131,7 +131,12 @@ def test_many_values_are_written_by_several_requests_if_that_is_wanted(
     ("words", "told"),
     [
         (("hr", "0", "65536"), "65536 is outside 0 to 65535 of uint16."),
-        (("hr", "0", "1", "-1"), "values[1]: -1 is outside 0 to 65535 of uint16."),
+        (
+            ("hr", "0", "1", "-1"),
+            "values[1]: -1 is outside 0 to 65535 of uint16; negative numbers "
+            "require --type, as in --type int16.",
+        ),
+        (("hr", "0", "-5", "--type", "uint32"), "-5 is outside 0 to 4294967295 of uint32."),
         (
             ("hr", "0", "1.5"),
             "'1.5' is not an integer, decimal or 0x; other values require --type.",

@@ -246,7 +246,9 @@ def _job(
             "several requests, which the device does not execute in one step."
         ) from error
     except ValueError as error:
-        raise click.UsageError(str(error)) from error
+        is_negative = kind is None and any(value < 0 for value in found)
+        signed = "; negative numbers require --type, as in --type int16" if is_negative else ""
+        raise click.UsageError(f"{error}{signed}") from error
 
 
 def _file_job(words: Sequence[str]) -> _FileJob:
