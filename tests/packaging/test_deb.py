@@ -42,6 +42,12 @@ def test_the_exposure_of_the_unit_is_below_two_of_ten(unit: Path) -> None:
     assert done.returncode == 0, done.stdout
 
 
+def test_the_process_sees_its_own_figures() -> None:
+    """The metrics `process_*`, by which an alarm judges open files, require `/proc/stat`."""
+    assert "\nProtectProc=invisible\n" in UNIT
+    assert "ProcSubset" not in UNIT
+
+
 def test_the_unit_runs_the_files_that_the_package_installs() -> None:
     listed = (DEB / "debian" / "holdfast-modbus.install").read_text()
     installed = dict(line.split() for line in listed.splitlines())
