@@ -48,6 +48,10 @@ def test_the_process_sees_its_own_figures() -> None:
     assert "ProcSubset" not in UNIT
 
 
+def test_a_stop_leaves_the_server_of_an_embedded_log_to_the_appliance() -> None:
+    assert "\nKillMode=mixed\n" in UNIT
+
+
 def test_the_unit_runs_the_files_that_the_package_installs() -> None:
     listed = (DEB / "debian" / "holdfast-modbus.install").read_text()
     installed = dict(line.split() for line in listed.splitlines())
