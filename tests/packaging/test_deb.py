@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 import subprocess
 import sys
@@ -68,6 +69,52 @@ def test_the_configuration_of_the_package_serves_this_machine_only() -> None:
     binds = re.findall(r"bind: (\S+):\d+$", (DEB / "holdfast.yaml").read_text(), re.MULTILINE)
     assert len(binds) == len(config.listeners) + 1
     assert all(ipaddress.ip_address(bind).is_loopback for bind in binds)
+
+
+@pytest.mark.parametrize("has_file", [True, False])
+@pytest.mark.parametrize("former", ["", "0.0.9"])
+@pytest.mark.parametrize("reason", ["", "group", "override"])
+def test_only_the_service_can_read_a_folder_that_the_package_has_made(
+    tmp_path: Path, has_file: bool, former: str, reason: str
+) -> None:
+    """Also after its removal, and without the file. What an administrator has set stays."""
+    folder, calls = tmp_path / "holdfast", tmp_path / "calls"
+    paths = [folder, folder / "holdfast.yaml"] if has_file else [folder]
+    folder.mkdir(mode=0o755)
+    folder.chmod(0o755)
+    if has_file:
+        paths[1].touch()
+        paths[1].chmod(0o644)
+    group = "another" if reason == "group" else folder.group()
+    script = (DEB / "debian" / "holdfast-modbus.postinst").read_text()
+    script = script.replace("/etc/holdfast", str(folder)).replace("= root ]", f"= {group} ]")
+    file = tmp_path / "postinst"
+    file.write_text(script)
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    for name, does in {
+        "systemd-sysusers": ":",
+        "py3compile": ":",
+        "chgrp": f'echo "$@" >> {calls}',
+        "dpkg-statoverride": "true" if reason == "override" else "false",
+    }.items():
+        (programs / name).write_text(f"#!/bin/sh\n{does}\n")
+        (programs / name).chmod(0o755)
+    environment = {"PATH": f"{programs}:{os.environ['PATH']}"}
+    command = [tool("sh"), str(file), "configure", former]
+    subprocess.run(command, check=True, env=environment)
+    modes = [path.stat().st_mode & 0o777 for path in paths]
+    if reason:
+        assert (modes, calls.exists()) == ([0o755, 0o644][: len(paths)], False)
+    else:
+        assert modes == [0o750, 0o640][: len(paths)]
+        assert calls.read_text() == "".join(f"holdfast {path}\n" for path in paths)
+
+
+def test_the_folder_of_the_configuration_is_never_packed_for_everybody() -> None:
+    rules = (DEB / "debian" / "rules").read_text()
+    assert "\tchmod 0750 debian/holdfast-modbus/etc/holdfast\n" in rules
+    assert "\tchmod 0640 debian/holdfast-modbus/etc/holdfast/holdfast.yaml\n" in rules
 
 
 @pytest.mark.parametrize(
