@@ -186,6 +186,31 @@ def test_callers_that_nobody_accepts_hold_up_neither_another_start_nor_a_stop(
     assert not list(runtime.iterdir())
 
 
+@pytest.mark.usefixtures("runtime")
+@pytest.mark.parametrize("closed", ["folder", "file"])
+def test_a_user_who_may_not_read_the_file_is_told_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, closed: str
+) -> None:
+    """As without `sudo`. Tests may run as root, who may read everything."""
+    file = tmp_path / "plant.yaml"
+    file.touch()
+    if closed == "folder":
+        stat = Path.stat
+
+        def refused(path: Path, **options: bool) -> os.stat_result:
+            if path == file:
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+            return stat(path, **options)
+
+        monkeypatch.setattr(Path, "stat", refused)
+    else:
+        monkeypatch.setattr(os, "access", lambda path, _: path != file)
+    with pytest.raises(
+        control.NotRunning, match=r"this user may not read it \(try sudo\), and no "
+    ):
+        control.ask(file, "sessions", within_s=wire.DEADLINE, ping_s=wire.DEADLINE)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="needs symbolic links")
 @pytest.mark.usefixtures("runtime")
 def test_it_is_found_by_its_path_when_a_symbolic_link_on_the_way_is_replaced(

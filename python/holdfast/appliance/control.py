@@ -188,9 +188,22 @@ def _answered(file: Path, request: bytes) -> dict[str, Any] | NotRunning:
         return answer if isinstance(answer, dict) else NotRunning(f"{file}: not an appliance")
     tried = ", ".join((*own, *others))
     # An appliance can run a file that is gone, so this is looked at last.
-    missing = "" if file.exists() else "no such file, and "
-    none = f"{missing}no appliance of this user runs it on this machine"
+    none = f"{_obstacle(file)}no appliance of this user runs it on this machine"
     return NotRunning(f"{file}: {none} (tried {tried})")
+
+
+def _obstacle(file: Path) -> str:
+    """Why the file is probably not the one that was meant, or this user not the right one."""
+    try:
+        file.stat()
+    except PermissionError:
+        pass
+    except (OSError, ValueError):
+        return "no such file, and "
+    else:
+        if os.access(file, os.R_OK):
+            return ""
+    return "this user may not read it (try sudo), and "
 
 
 class _UnixListener:
