@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
+    from holdfast.events import Format
+
 
 @pytest.fixture
 def pipe() -> Iterator[tuple[int, Any]]:
@@ -42,6 +44,28 @@ def test_lines_arrive_in_order(pipe: tuple[int, Any]) -> None:
     handler.flush()
     expected = "".join(f"{number} °C\n" for number in range(100))
     assert os.read(reader, 65536).decode() == expected
+
+
+@pytest.mark.parametrize("form", ["text", "json"])
+def test_lines_for_the_journal_begin_with_their_priority(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: Format
+) -> None:
+    levels = {"DEBUG": 7, "INFO": 6, "WARNING": 4, "ERROR": 3}
+    records = [{"msg": "listening", "levelname": level} for level in levels]
+    records.append({"msg": "is served"})  # Text without a level, as at the start.
+    with (tmp_path / "journal").open("w+") as journal, (tmp_path / "other").open("w+") as other:
+        found = os.fstat(journal.fileno())
+        monkeypatch.setenv("JOURNAL_STREAM", f"{found.st_dev}:{found.st_ino}")
+        for stream in (journal, other):
+            handler = QueuedHandler(stream)
+            handler.setFormatter(LineFormatter(form))
+            for record in records:
+                handler.emit(logging.makeLogRecord({"created": 0.0, **record}))
+            handler.flush()
+            stream.seek(0)
+        lines = journal.readlines()
+        assert [line[:3] for line in lines[:-1]] == [f"<{level}>" for level in levels.values()]
+        assert [line[3:] for line in lines[:-1]] + lines[-1:] == other.readlines()
 
 
 def test_a_console_of_windows_gets_its_own_encoding(

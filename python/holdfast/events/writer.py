@@ -22,6 +22,9 @@ MAX_LINES_PER_WRITE = 500
 CLOSE_TIMEOUT_S = 1.0
 """Seconds that the end of the program waits for the lines, by default."""
 
+PRIORITIES = {"DEBUG": 7, "INFO": 6, "WARNING": 4, "ERROR": 3, "CRITICAL": 2}
+"""The levels of lines, as numbers of syslog(3)."""
+
 
 class QueuedHandler(logging.Handler):
     """Queues lines for a stream.
@@ -39,6 +42,7 @@ class QueuedHandler(logging.Handler):
         self._ends_in_line = False
         """Whether the last byte in the stream is no line feed: a full disk has cut off a line."""
         self._noted = 0
+        self._is_journal = _is_journal(stream)
         self.dropped = 0
         threading.Thread(target=self._write_for_ever, name="holdfast-log", daemon=True).start()
 
@@ -55,6 +59,13 @@ class QueuedHandler(logging.Handler):
             else:
                 self._lines.append(line)
             self._changed.notify_all()
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line, for the journal of systemd with its priority; see sd-daemon(3)."""
+        line = super().format(record)
+        if self._is_journal and (priority := PRIORITIES.get(record.levelname)) is not None:
+            return f"<{priority}>{line}"
+        return line
 
     def flush(self) -> None:
         """Waits until all lines are written, up to the timeout."""
@@ -121,6 +132,21 @@ class QueuedHandler(logging.Handler):
                 self._ends_in_line = data[:count][-1:] != b"\n"
                 data = data[count:]
         return 0
+
+
+def _is_journal(stream: TextIO) -> bool:
+    """Whether systemd has connected the stream with its journal, which takes the prefix away.
+
+    The variable alone does not say so: processes inherit it whose stream is another one.
+    """
+    named = os.environ.get("JOURNAL_STREAM")
+    if not named:
+        return False
+    try:
+        found = os.fstat(stream.fileno())
+    except (OSError, ValueError):  # It is no file.
+        return False
+    return named == f"{found.st_dev}:{found.st_ino}"
 
 
 def announce(text: str) -> None:
