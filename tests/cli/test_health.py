@@ -77,6 +77,31 @@ def test_an_appliance_that_serves_is_ready_until_it_ends(
     assert answer("health", file, code=1)["detail"] == os.strerror(errno.ECONNREFUSED)
 
 
+def test_the_running_appliance_is_asked_whatever_is_in_its_file(
+    run: Callable[..., RunCommand], tmp_path: Path
+) -> None:
+    """An edited file takes effect with a reload. An appliance that serves must not be killed for
+    it, as containers are that are not healthy."""
+    appliance = run(metrics={"bind": "127.0.0.1:0"})  # Only the appliance knows its port.
+    path = tmp_path / "plant.yaml"
+    file, kept = str(path), path.read_text()
+    wire.until(lambda: invoke("health", file).exit_code == 0, "it is ready")
+    metrics, port = {"metrics": {"bind": f"127.0.0.1:{free_port()}"}}, free_port()
+    for edited in ("wrong: 1\n", written(PLANT), written({**PLANT, **metrics})):
+        path.write_text(edited)
+        assert done("health", file)[0] == "ready"
+    path.write_text(written({**PLANT, "metrics": {"bind": f"127.0.0.1:{port}"}}))
+    done("reload", file)
+    assert answer("health", file)["target"] == f"http://127.0.0.1:{port}/health/ready"
+    path.write_text(written(PLANT))
+    done("reload", file)
+    path.write_text(kept)
+    assert "no section `metrics` or `gateway`" in usage_error("health", file)
+    path.write_text("wrong: 1\n")
+    assert appliance.end(signal.SIGTERM)[0] == 0
+    assert invoke("health", file).exit_code == 2
+
+
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system has no /proc")
 def test_a_process_that_hangs_does_not_answer_in_time(
     run: Callable[..., RunCommand], tmp_path: Path
@@ -92,6 +117,7 @@ def test_a_process_that_hangs_does_not_answer_in_time(
     )
     result = invoke("health", file, "--live", "--timeout", "0.5")
     assert (result.exit_code, "no answer in 0.5 s" in result.stderr) == (1, True)
+    assert answer("health", file, "--timeout", "0.1", code=1)["reason"] == "connection"
     process.send_signal(signal.SIGCONT)
     wire.until(lambda: invoke("health", file, "--live").exit_code == 0, "it is live")
 

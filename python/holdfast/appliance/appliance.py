@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from holdfast import _core
 from holdfast.appliance.diagnostics import Diagnostics
-from holdfast.appliance.health import Health
+from holdfast.appliance.health import SERVICES, Health, probe_url
 from holdfast.appliance.liveness import Liveness
 from holdfast.appliance.parts.audit import AuditLog
 from holdfast.appliance.parts.certificate_expiry import CertificateExpiry
@@ -138,6 +138,18 @@ class Appliance:
     def endpoints(self) -> list[ListenAddress]:
         """Returns the addresses of all listeners and services, in configuration order."""
         return self._require_running().endpoints()
+
+    def probe_url(self) -> tuple[str, str] | None:
+        """What `holdfast.appliance.health.probe_url` returns for the service that answers probes.
+
+        `None` without one. Thread-safe.
+        """
+        running = self._require_running()
+        endpoints = running.services.endpoints | running.metrics.endpoints
+        for name in SERVICES:
+            if (found := endpoints.get(name)) is not None:
+                return probe_url(name, found.settings, found.port.address[1])
+        return None
 
     def log_events(self, timeout: float) -> None:
         """Waits up to `timeout` seconds for a listener event and logs it.

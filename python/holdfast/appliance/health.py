@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from holdfast.net.addresses import admits, joined, reachable
 from holdfast.net.http.health import Check
 
 if TYPE_CHECKING:
@@ -12,10 +13,23 @@ if TYPE_CHECKING:
 
     from holdfast.appliance.liveness import Liveness
     from holdfast.appliance.parts.shared_logs import SharedLogs
+    from holdfast.appliance.services.services import HttpConfig
     from holdfast.appliance.services.supervision import Supervisor
+
+SERVICES = ("metrics", "gateway")
+"""The sections of services that answer probes, in the order to try."""
 
 MAX_NAMES = 5
 """The most names in the detail of a check."""
+
+
+def probe_url(name: str, settings: HttpConfig, port: int) -> tuple[str, str]:
+    """Returns the URL at which this machine asks a service, and why it may refuse that."""
+    scheme = "http" if settings.tls is None else "https"
+    host = reachable(settings.bind.host, settings.sources)
+    refused = not admits(settings.sources, host)
+    hint = f"; {name}.sources does not contain {host}" if refused else ""
+    return f"{scheme}://{joined(host, port)}", hint
 
 
 @dataclass(eq=False)

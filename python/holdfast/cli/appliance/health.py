@@ -8,18 +8,20 @@ import json
 import ssl
 import sys
 import threading
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import click
 
+from holdfast.appliance.control import NotRunning, ask
+from holdfast.appliance.health import SERVICES, probe_url
 from holdfast.cli.exit_codes import ExitCode, fail
 from holdfast.cli.options.duration import Duration, timeout_option
 from holdfast.cli.options.option import flag, json_option, option
 from holdfast.cli.options.tls import tls_options
 from holdfast.cli.terminal_text import plain, print_json, show_problems, table
-from holdfast.net.addresses import admits, joined, reachable
 from holdfast.net.http import health as probes
 from holdfast.net.secure_channel import failure_text
 from holdfast.runtime.bounded_files import require_stored
@@ -30,12 +32,14 @@ if TYPE_CHECKING:
 MAX_ANSWER_BYTES = 1 << 20
 """The most bytes of an answer that are read."""
 
-SERVICES = ("metrics", "gateway")
-"""The sections of services that answer probes, in the order to try."""
-
 
 class _NoAnswer(Exception):
     """The appliance has not answered a probe."""
+
+    @classmethod
+    def within(cls, timeout: float) -> _NoAnswer:
+        """The time is over."""
+        return cls(f"no answer in {timeout:g} s")
 
 
 @click.command(epilog="Example: holdfast health plant.yaml")
@@ -50,24 +54,28 @@ def health(
 ) -> None:
     """Ask the appliance that runs FILE on this machine whether it is ready.
 
-    The address is that of the section `metrics` in FILE, otherwise of `gateway`. --url is faster,
-    because no configuration is read. A certificate is verified only with --url or --tls-ca.
+    The address is that of the section `metrics`, otherwise of `gateway`: as the running appliance
+    has it, if it is one of this user, otherwise as FILE has it. A certificate is verified only with
+    --url or --tls-ca.
 
-    Exit codes: 0 ready (with --live: live), 1 not ready or no valid answer, 2 wrong usage, or
-    FILE has errors or neither section.
+    Exit codes: 0 ready (with --live: live), 1 not ready or no valid answer, 2 wrong usage, neither
+    section, or FILE has errors and no appliance of this user runs it.
     """
     if (file is None) == (url is None):
         raise click.UsageError("Give either FILE or --url.")
-    hint = ""
+    hint, until = "", time.monotonic() + timeout
     if url is None:
         assert file is not None
-        base, hint = _url_from_config(file)
+        found = _url_of_running(file, timeout)
+        if found is None:  # Reading the configuration is no part of the answer.
+            found, until = _url_from_config(file), time.monotonic() + timeout
+        base, hint = found
         context = _context(tls, verified=tls.ca is not None)
     else:
         base, context = _checked_url(url), _context(tls, verified=True)
     path = probes.LIVE if live else probes.READY
     try:
-        probe = _probe(base, path, timeout, context)
+        probe = _probe(base, path, timeout, until, context)
     except _NoAnswer as error:
         fail(f"{base}{path}: {error}{hint}", reason="connection", target=f"{base}{path}")
     state = "live" if live else "ready"
@@ -80,6 +88,27 @@ def health(
     else:
         click.echo(_shown(probe, state))
     sys.exit(ExitCode.SUCCESS if probe["ok"] else ExitCode.FAILED)
+
+
+def _url_of_running(file: Path, timeout: float) -> tuple[str, str] | None:
+    """The URL of the service of the appliance that runs a configuration, which may have changed
+    since, and why it may refuse this machine. `None` if no appliance says so.
+
+    Exits with 1 if one does not answer in time, and with 2 if it has no such service.
+    """
+    until = time.monotonic() + timeout
+    try:
+        answer = ask(file, "probe_url", within_s=timeout, ping_s=timeout)
+    except NotRunning:
+        if time.monotonic() < until:
+            return None
+        fail(f"{file}: {_NoAnswer.within(timeout)}", reason="connection", target=file)
+    if "found" not in answer:  # An appliance of an earlier version.
+        return None
+    if answer["found"] is None:
+        raise _without_service(f"The appliance that runs {file}")
+    base, hint = map(plain, answer["found"])
+    return base, hint
 
 
 def _url_from_config(file: Path) -> tuple[str, str]:
@@ -100,13 +129,13 @@ def _url_from_config(file: Path) -> tuple[str, str]:
             continue
         if service.bind.port == 0:
             raise click.UsageError(f"{file}: {name}.bind has port 0: use --url.")
-        scheme = "http" if service.tls is None else "https"
-        host = reachable(service.bind.host, service.sources)
-        refused = not admits(service.sources, host)
-        hint = f"; {name}.sources does not contain {host}" if refused else ""
-        return f"{scheme}://{joined(host, service.bind.port)}", hint
+        return probe_url(name, service, service.bind.port)
+    raise _without_service(str(file))
+
+
+def _without_service(who: str) -> click.UsageError:
     sections = " or ".join(f"`{name}`" for name in SERVICES)
-    raise click.UsageError(f"{file} has no section {sections}, which answer probes.")
+    return click.UsageError(f"{who} has no section {sections}, which answer probes.")
 
 
 def _checked_url(url: str) -> str:
@@ -140,16 +169,18 @@ def _context(tls: Tls, *, verified: bool) -> ssl.SSLContext:
     return context
 
 
-def _probe(base: str, path: str, timeout: float, context: ssl.SSLContext) -> dict[str, Any]:
-    """The answer to a probe. Raises `_NoAnswer`."""
+def _probe(
+    base: str, path: str, timeout: float, until: float, context: ssl.SSLContext
+) -> dict[str, Any]:
+    """The answer to a probe. Raises `_NoAnswer`, also when the timeout is over, at `until`."""
     found: list[dict[str, Any] | _NoAnswer] = []
     # A socket timeout limits each step; nothing limits the name lookup and all steps together.
     asking = threading.Thread(
         target=lambda: found.append(_response(base, path, timeout, context)), daemon=True
     )
     asking.start()
-    asking.join(timeout)
-    outcome = found[0] if found else _NoAnswer(f"no answer in {timeout:g} s")
+    asking.join(max(0.0, until - time.monotonic()))
+    outcome = found[0] if found else _NoAnswer.within(timeout)
     if isinstance(outcome, _NoAnswer):
         raise outcome
     return outcome
@@ -171,7 +202,7 @@ def _response(
             response = connection.getresponse()
             status, body = response.status, response.read(MAX_ANSWER_BYTES)
     except TimeoutError:
-        return _NoAnswer(f"no answer in {timeout:g} s")
+        return _NoAnswer.within(timeout)
     # `ValueError`: the host is not a valid name.
     except (OSError, http.client.HTTPException, ValueError) as error:
         return _NoAnswer(plain(failure_text(error)))

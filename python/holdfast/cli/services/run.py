@@ -173,6 +173,7 @@ def _control(appliance: Appliance, reloading: Reloader, file: Path) -> Callable[
     handlers: dict[str, Callable[..., Mapping[str, Any]]] = {
         "reload": reloading.ask,
         "sessions": lambda: {"sessions": appliance.sessions()},
+        "probe_url": lambda: {"found": appliance.probe_url()},
         "replicas": lambda: {"logs": appliance.replicas()},
         "end": lambda listener, id: {"ended": appliance.end_session(listener, id, SOURCE)},
     }
