@@ -623,8 +623,8 @@ impl<F: Framing> Answering<F> {
             return 0;
         };
         let ours = (&*self.unit_server, &*self.rights);
-        let (len, refused) = self.context.answer(ours, Some(&self.peer), unit_id, request, buffer);
-        self.context.note_refused(refused, &self.reported, Some(&self.peer));
+        let peer = (Some(&self.peer), &self.reported);
+        let len = self.context.answer(ours, peer, unit_id, request, buffer);
         let answered = &buffer[..len.unwrap_or_default()];
         self.delimiter = changed_delimiter(request, answered).unwrap_or(self.delimiter);
         len.map_or(0, |len| F::complete(output, tag, unit_id, len))

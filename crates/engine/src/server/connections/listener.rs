@@ -177,17 +177,16 @@ impl ListenerContext {
         }
     }
 
-    /// Answers a request from a memory: permits it, and records it if it writes. Returns the length of the
-    /// reply, if there is one, and what was refused.
-    #[inline]
+    /// Answers a request from a memory: permits it, records it if it writes, and reports it if it is refused.
+    /// Returns the length of the reply, if there is one.
     pub(crate) fn answer(
         &self,
         (unit_server, rights): (&UnitServer, &PeerRights),
-        peer: Option<&Peer>,
+        (peer, reported): (Option<&Peer>, &Reported),
         unit_id: u8,
         request: &[u8],
         reply: &mut Buffer,
-    ) -> (Option<usize>, Option<RefusedRequest>) {
+    ) -> Option<usize> {
         let is_for_listen_only = unit_server.listen_only.refuses(request);
         if is_for_listen_only {
             self.report(Kind::RefusedListenOnly, peer.cloned());
@@ -208,7 +207,10 @@ impl ListenerContext {
             auditor.note(&self.name, peer, unit, (request, answered), permit);
         }
         // A request for listen only mode has been reported as such.
-        (len, refused.filter(|_| !is_for_listen_only))
+        if !is_for_listen_only {
+            self.note_refused(refused, reported, peer);
+        }
+        len
     }
 
     /// Reports a request without a reply that has silenced its unit, or ended that.

@@ -36,8 +36,8 @@ impl ListenOnly {
     /// Whether a request would set a unit to listen only mode, and the listener does not allow that.
     #[inline]
     pub(crate) fn refuses(&self, request: &[u8]) -> bool {
-        !self.is_allowed.load(Ordering::Relaxed)
-            && asks_for(request, SubFunction::ForceListenOnlyMode)
+        asks_for(request, SubFunction::ForceListenOnlyMode)
+            && !self.is_allowed.load(Ordering::Relaxed)
     }
 
     #[inline]

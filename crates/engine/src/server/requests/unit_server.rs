@@ -258,14 +258,14 @@ impl UnitServer {
             return Err(NOT_ALLOWED);
         }
         let memory = memory.ok_or(ExceptionCode::GatewayTargetFailedToRespond)?;
-        let request = request?;
-        if rights.ranges(unit_id).is_some_and(|ranges| !ranges.allow(&request)) {
+        let request = request.as_ref().map_err(|code| *code)?;
+        if rights.ranges(unit_id).is_some_and(|ranges| !ranges.allow(request)) {
             return Err(out_of_ranges(memory));
         }
         if !can_record() {
             return Err(ExceptionCode::ServerDeviceFailure);
         }
-        match request {
+        match *request {
             Request::ReadCoils(range) => {
                 read(memory, Area::Coils, range, reply::read_coils(range, reply))
             }

@@ -185,7 +185,7 @@ impl PeerRights {
                     .map_or_else(|| self.units.iter().flatten().any(may_change), may_change)
         };
         let refused = !self.allows(unit_id, function_code)
-            || *request == Err(ExceptionCode::IllegalFunction)
+            || matches!(request, Err(ExceptionCode::IllegalFunction))
             || changes_state();
         refused.then_some(NOT_ALLOWED)
     }

@@ -346,8 +346,7 @@ impl ModbusSerial {
             return None;
         }
         let ours = (&*self.unit_server, &*rights);
-        let (len, refused) = context.answer(ours, None, unit_id, request, reply);
-        context.note_refused(refused, &self.reported, None);
+        let len = context.answer(ours, (None, &self.reported), unit_id, request, reply);
         let answered = &reply[..len.unwrap_or_default()];
         if let Some(delimiter) = changed_delimiter(request, answered) {
             self.delimiter.store(delimiter, Ordering::Relaxed);

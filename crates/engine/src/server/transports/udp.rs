@@ -243,8 +243,8 @@ impl ModbusUdp {
             };
         }
         let ours = (&*self.unit_server, &*rights);
-        let (len, refused) = context.answer(ours, Some(&peer.into()), unit_id, request, buffer);
-        context.note_refused(refused, &Reported::default(), Some(&peer.into()));
+        let peer = (Some(&peer.into()), &Reported::default());
+        let len = context.answer(ours, peer, unit_id, request, buffer);
         len.map_or(0, |len| D::complete(output, tag, unit_id, len))
     }
 }
