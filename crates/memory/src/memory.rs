@@ -374,6 +374,7 @@ impl Content {
         }
     }
 
+    #[inline(always)]
     fn copy_out(&self, offset: usize, read: &mut Read<'_>) {
         let area = &self.areas[read.area.index()];
         debug_assert!(read.area.byte_len(offset + read.count) <= area.len(), "{read:?}");

@@ -14,6 +14,8 @@ impl Memory {
     /// # Errors
     /// [`Refusal::Sealed`] (for a client), then `WrongLength`, `OutOfRange`, `Stale`. Then `out` is
     /// unchanged.
+    // Inlined with what it calls: the callers that matter know the area.
+    #[inline(always)]
     pub fn read(&self, access: Access, mut read: Read<'_>) -> Result<(), Refusal> {
         let offset = self.readable(&read);
         let content = self.shared();

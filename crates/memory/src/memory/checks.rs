@@ -55,6 +55,7 @@ impl Memory {
     }
 
     /// Checks a read, without the lock.
+    #[inline(always)]
     pub(super) fn readable(&self, read: &Read<'_>) -> Result<usize, Refusal> {
         if read.count == 0 || read.out.len() != read.area.byte_len(read.count) {
             return Err(Refusal::WrongLength);

@@ -186,6 +186,8 @@ impl Worker {
         }
     }
 
+    // Inlined, a source that is alone would save the registers for it.
+    #[inline(never)]
     fn poll_among_others(&mut self, share: &mut Share, context: &mut Context<'_>) -> Poll<()> {
         let source = &mut self.sources[share.place];
         source.replenish(self.round);
