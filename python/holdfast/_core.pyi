@@ -756,8 +756,11 @@ class HttpExchange:
     def end(self, is_complete: bool) -> None:
         """Ends a stream. One that is not complete is cut off."""
 
-    def watch_client(self) -> None:
-        """From now on, a client that has half-closed its connection is gone, as after `begin`."""
+    def watch_client(self) -> bool:
+        """Whether the client is still there. Thread-safe.
+
+        From now on, one that has half-closed its connection is gone, as after `begin`.
+        """
 
     def abandon(self) -> None:
         """Ends the connection: there will be no response."""

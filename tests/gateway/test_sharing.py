@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import socket
+import threading
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from holdfast.config import load
+from holdfast.gateway import device as gateway_device
+from holdfast.gateway.device import RequestedDevice
 from support import wire
 from support.fake_device import HANG_UP, FakeDevice, Stream, exception, silent
 from support.machine import needs_127_0_0_2
@@ -280,6 +284,50 @@ def test_a_write_that_was_given_up_before_its_turn_is_never_sent(
         assert read(appliance, device.port, 6).json["values"] == [6]
         await_count(appliance, "withdrawn", 1)
     assert [asked.pdu[0] for asked in device.requests] == [3, 3]
+
+
+KINDS = [("tcp", True), ("tcp", False), ("rtu+tcp", False)]
+
+
+@pytest.mark.parametrize(("kind", "is_shared"), KINDS)
+def test_a_write_is_not_sent_if_its_client_goes_during_a_standstill(
+    run: Run, monkeypatch: pytest.MonkeyPatch, kind: str, is_shared: bool
+) -> None:
+    arrived, goes_on = threading.Event(), threading.Event()
+    ask_device = RequestedDevice.ask
+
+    async def stands_still(self: RequestedDevice, call: Any) -> Any:
+        arrived.set()
+        assert goes_on.wait(wire.DEADLINE)
+        return await ask_device(self, call)
+
+    with Stream(kind) as device, Stream("tcp") as other:
+        appliance = run(with_gateway((device if is_shared else other).url))
+        where = {"transport": kind}
+        assert read(appliance, device.port, 7, **where).json["values"] == [7]
+        monkeypatch.setattr(RequestedDevice, "ask", stands_still)
+        body = {"host": "127.0.0.1", "port": device.port, **where, "address": 9, "value": 1}
+        gone = unanswered(appliance, "/write/register", body)
+        assert arrived.wait(wire.DEADLINE)
+        gone.close()
+        goes_on.set()
+        assert read(appliance, device.port, 8, **where).json["values"] == [8]
+    assert {asked.pdu[0] for asked in device.requests} == {3}
+
+
+@pytest.mark.parametrize(("kind", "is_shared"), KINDS)
+def test_a_write_is_not_sent_after_its_timeout_has_passed_in_a_standstill(
+    run: Run, monkeypatch: pytest.MonkeyPatch, kind: str, is_shared: bool
+) -> None:
+    with Stream(kind) as device, Stream("tcp") as other:
+        appliance = run(with_gateway((device if is_shared else other).url))
+        clock = SimpleNamespace(now=iter([0.0, *[61.0] * 9]).__next__)
+        monkeypatch.setattr(gateway_device, "standstill", clock)
+        body = {"transport": kind, "timeout": 60_000, "address": 9, "value": 1}
+        answer = ask(appliance, "/write/register", device.port, **body)
+        assert failure(answer) == (500, "timeout", UNSENT)
+        assert answer.headers["holdfast-maybe-written"] == "false"
+        assert not device.requests
 
 
 @pytest.mark.parametrize("is_shared", [True, False], ids=["shared", "own"])

@@ -585,6 +585,31 @@ def test_a_write_of_rest_is_not_sent_once_its_client_has_gone(
     assert [line["outcome"] for line in writes(log)] == ["withdrawn", "done", "done"]
 
 
+@pytest.mark.parametrize("leave", [wire.Connection.close, wire.Connection.finish])
+def test_a_write_of_rest_is_not_sent_if_its_client_goes_during_a_standstill(
+    run: Run, monkeypatch: pytest.MonkeyPatch, leave: Callable[[wire.Connection], None]
+) -> None:
+    arrived, goes_on = threading.Event(), threading.Event()
+    carry_out = DeviceWrites.carry_out
+
+    async def stands_still(self: DeviceWrites, *arguments: Any) -> Any:
+        arrived.set()
+        assert goes_on.wait(wire.DEADLINE)
+        return await carry_out(self, *arguments)
+
+    monkeypatch.setattr(DeviceWrites, "carry_out", stands_still)
+    with plc() as source:
+        appliance = started(run, source)
+        with posted(appliance, 1) as gone:
+            assert arrived.wait(wire.DEADLINE)
+            leave(gone)
+            goes_on.set()
+            wire.until(lambda: of_rest(appliance)["refused"] == {"withdrawn": 1}, "it is withdrawn")
+        with posted(appliance, 2) as next_one:
+            assert answer(next_one).status == 200
+        assert [pdu[-1] for pdu in writes_of(source)] == [2]
+
+
 @pytest.mark.parametrize("over", ["modbus", "rest"])
 def test_the_write_of_a_client_that_has_gone_while_the_line_was_busy_is_not_sent(
     run: Run, over: str
@@ -695,6 +720,9 @@ def test_a_write_whose_answer_nobody_waited_for_is_recorded(tmp_path: Path) -> N
             return 1  # The caller knows no such ticket: its turn has come.
 
     class Sent(Request):
+        def is_client_there(self) -> bool:
+            return True
+
         def when_gone(self, function: object) -> None:
             pass
 

@@ -63,8 +63,8 @@ impl HttpExchange {
         self.core.end(is_complete);
     }
 
-    fn watch_client(&self) {
-        self.core.watch_client();
+    fn watch_client(&self) -> bool {
+        self.core.watch_client()
     }
 
     /// Cuts off the connection, unless there has been a response.

@@ -70,7 +70,10 @@ class OwnTransport(AsyncTransport, Protocol):
         timeout: float,
         note_sent: Callable[[], None] | None = None,
     ) -> Awaitable[Any]:
-        """Calls `note_sent` when the device may receive the request from now on."""
+        """Calls `note_sent` when the device may receive the request from now on.
+
+        It may be called again, in any thread, and nothing is sent if it raises.
+        """
         ...
 
 
@@ -113,7 +116,7 @@ class ThreadedConnection:
         if self._thread is None or self._thread.is_closed:  # The end of the program closes it too.
             self._thread = _CallThread(self._core, self._closing)
             self._closing = None
-        return await self._thread.carry(request, unit, timeout)
+        return await self._thread.carry(request, unit, timeout, note_sent)
 
     async def close(self) -> None:
         """Closes the connection; the current call and waiting calls fail."""
@@ -161,11 +164,19 @@ class _CallThread(OwnThread):
         if closing is not None:
             self.submit(closing.result)
 
-    async def carry(self, request: Request, unit: int, timeout: float) -> Any:
+    async def carry(
+        self,
+        request: Request,
+        unit: int,
+        timeout: float,
+        note_sent: Callable[[], None] | None = None,
+    ) -> Any:
         """Sends a request after the calls before it, and waits for the result."""
         cancelled = Event()
 
         def is_over() -> bool:
+            if note_sent is not None:
+                note_sent()  # The core asks until it sends, and sends nothing after an error.
             return cancelled.is_set() or self.is_closed
 
         def call() -> Any:

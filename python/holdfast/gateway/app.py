@@ -270,7 +270,18 @@ class App(Application):
         with self._request():
             if is_write and not self._settings.writes:
                 raise BadRequest("writes_off", f"writes are disabled: {WRITES_ON}")
-            device = RequestedDevice(self._routes, self._pool, given, broadcast=endpoint.broadcast)
+
+            def check_client() -> None:
+                if not request.is_client_there():
+                    raise ClientDisconnected
+
+            device = RequestedDevice(
+                self._routes,
+                self._pool,
+                given,
+                broadcast=endpoint.broadcast,
+                check_client=check_client if is_write else None,
+            )
             with self._request_to(device):
                 reply = partial(self._reply, request, endpoint, given, device, is_write)
                 work = self._repeated.write_once(request, device, reply) if is_write else reply()

@@ -25,6 +25,7 @@ from holdfast.net.http.fields import malformed
 from holdfast.net.http.requests import BadRequest, RequestError
 from holdfast.net.resolver import NoSuchName
 from holdfast.protocol import BROADCAST_CODES, usual_port
+from holdfast.runtime import standstill
 from holdfast.runtime.text import all_of
 from holdfast.types import SERIAL_FRAMES
 
@@ -72,8 +73,13 @@ class RequestedDevice:
         given: Mapping[str, Any],
         *,
         broadcast: bool = False,
+        check_client: Callable[[], None] | None = None,
     ) -> None:
-        """`broadcast`: whether the request may be a broadcast. Raises `BadRequest`."""
+        """Raises `BadRequest`.
+
+        `broadcast`: whether the request may be a broadcast. `check_client` raises if the client of
+        a write no longer waits for it. It is called in any thread.
+        """
         self.transport: Transport = given["transport"]
         if given["serverName"] is not None and self.transport != "tls":
             raise malformed("serverName requires transport tls")
@@ -93,6 +99,7 @@ class RequestedDevice:
         """Whether the last call has sent nothing."""
         self._routes = routes
         self._pool = pool
+        self._check_client = check_client
 
     @property
     def where(self) -> str:
@@ -128,12 +135,20 @@ class RequestedDevice:
 
     async def attempt(self, call: Callable[[Client], Awaitable[Result]]) -> Result:
         """As `ask`, but connection errors, timeouts and invalid responses raise `ModbusError`."""
-        began = time.perf_counter()
+        began, latest = time.perf_counter(), standstill.now() + self.timeout
         turns, route = None, None
+
+        def check_write() -> None:
+            if self._check_client is not None:
+                self._check_client()
+            # After a standstill, the event loop may come here before it finds the timeout.
+            if standstill.now() > latest:
+                raise RequestTimeout(f"not sent within {self.timeout} s", maybe_sent=False)
 
         def run(given: Turns) -> Awaitable[Result]:
             nonlocal turns
             turns = given
+            turns.check_write = check_write
             return call(_RequestClient(turns, self.unit, self.timeout))
 
         try:

@@ -14,6 +14,7 @@ import asyncio
 import contextlib
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from math import inf
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -97,10 +98,11 @@ class _PoolTurns(Turns):
         if device.in_flight < device.most:
             device.in_flight += 1
             try:
-                return await self._pool.send(device, request, unit, timeout, self._note_sent)
+                note_sent = partial(self._note_sent, request)
+                return await self._pool.send(device, request, unit, timeout, note_sent)
             finally:
                 self._pool.pass_on(device)
-        waiting = device.waiting.join(request, unit, timeout)
+        waiting = device.waiting.join(request, unit, timeout, self.check)
         caller = asyncio.get_running_loop().create_future()
         waiting.callers.append(caller)
         try:
@@ -114,7 +116,8 @@ class _PoolTurns(Turns):
                 elif waiting.is_queued:
                     device.waiting.leave(waiting)
 
-    def _note_sent(self) -> None:
+    def _note_sent(self, request: Request) -> None:
+        self.check(request)
         self.is_sent = True
 
 

@@ -21,9 +21,12 @@ from holdfast.errors import (
     RequestTimeout,
 )
 from holdfast.gateway.broadcast import is_broadcast
+from holdfast.gateway.shared_reads import READS
 from holdfast.polling.calls import Calls
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from holdfast._core import Endpoint, Link, Poller, Request
     from holdfast.client.url import NetworkTarget
 
@@ -131,6 +134,13 @@ class Turns:
         self.target = target
         self.is_sent = False
         """Whether the device may have received a request."""
+        self.check_write: Callable[[], None] | None = None
+        """Raises if a write must not be sent any more."""
+
+    def check(self, request: Request) -> None:
+        """Called at the last moment before a request is sent. Raises what `check_write` raises."""
+        if self.check_write is not None and request.pdu[0] not in READS:
+            self.check_write()
 
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
         """Sends a request when its turn comes. Raises the errors of a client.
@@ -164,6 +174,7 @@ class _LinkTurns(Turns):
     async def call(self, request: Request, unit: int, timeout: float) -> Any:
         left = max(min(self._deadline - time.monotonic(), timeout), MIN_TIMEOUT_S)
         broadcast = is_broadcast(self.target.transport, unit)
+        self.check(request)
         ticket = self._link.call(
             self._calls.caller, request, unit, left, broadcast=broadcast, peers=self._peers
         )

@@ -15,6 +15,7 @@ from holdfast.protocol import READ_FUNCTIONS
 
 if TYPE_CHECKING:
     import asyncio
+    from collections.abc import Callable
 
     from holdfast._core import Request
 
@@ -30,6 +31,8 @@ class Waiting:
     unit: int
     timeout: float
     """The longest timeout of its callers."""
+    check: Callable[[Request], None]
+    """Raises if it must not be sent any more. It never does for a read."""
     callers: list[asyncio.Future[Any]] = field(default_factory=list)
     worker: asyncio.Task[None] | None = None
     """Sends it; `None` before its turn, and after its end."""
@@ -38,7 +41,8 @@ class Waiting:
     """Whether the device may have received it."""
 
     def note_sent(self) -> None:
-        """The device may receive it from now on."""
+        """The device may receive it from now on, unless `check` raises."""
+        self.check(self.request)
         self.is_sent = True
 
     def end(self, outcome: Any) -> None:
@@ -71,7 +75,9 @@ class WaitingRequests:
         """The request that is next."""
         return self._queue[0]
 
-    def join(self, request: Request, unit: int, timeout: float) -> Waiting:
+    def join(
+        self, request: Request, unit: int, timeout: float, check: Callable[[Request], None]
+    ) -> Waiting:
         """Queues a request, or returns an equal read that waits."""
         read = unit, request.pdu
         is_read = request.pdu[0] in READS
@@ -82,7 +88,7 @@ class WaitingRequests:
             equal = self._reads[read]
             equal.timeout = max(equal.timeout, timeout)
             return equal
-        new = Waiting(request, unit, timeout)
+        new = Waiting(request, unit, timeout, check)
         self._queue.append(new)
         if is_read:
             self._reads[read] = new

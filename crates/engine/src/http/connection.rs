@@ -202,7 +202,7 @@ fn answered(
     line: SharedLine,
     request: Request<Incoming>,
 ) -> impl Future<Output = Result<Response<ResponseBody>, Abandoned>> {
-    let exchange = front.exchange();
+    let exchange = front.exchange(line.downgrade());
     let len = request.body().size_hint().exact();
     let version = request.version();
     let expects = request.headers().contains_key(EXPECT);

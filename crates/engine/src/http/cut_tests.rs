@@ -1,11 +1,20 @@
-//! Requests cut and joined in every way: the responses and what was counted are the same.
+//! Requests cut and joined in every way: the responses and what was counted are the same. And the end of a client.
 
+use std::io::Write;
+use std::net::{Shutdown, TcpStream};
+use std::pin::pin;
+use std::sync::Arc;
+use std::time::Instant;
+
+use tokio::net::TcpListener;
 use tokio::sync::watch;
 use tokio::task::yield_now;
 
 use super::connection::converse;
 use super::exchange::Event;
 use super::in_memory::{front, line, outcome, runtime};
+use super::line::SharedLine;
+use crate::server::Peer;
 
 fn post(path: &str, headers: &str, body: &str) -> String {
     let len = body.len();
@@ -106,4 +115,32 @@ fn a_body_that_has_arrived_with_its_header_is_handed_over_with_it() {
         }
     });
     assert!(matches!(event, Event::Request { body: Some(body), .. } if body == "four"));
+}
+
+#[test]
+fn the_end_of_a_client_is_found_while_the_thread_of_its_connection_stands_still() {
+    let (front, inbox) = front();
+    runtime().block_on(async {
+        let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
+        let mut client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let (stream, peer) = listener.accept().await.unwrap();
+        let (ticket, _) = front.context.admission.admit(peer).unwrap();
+        let due = Instant::now() + front.settings.request_timeout;
+        let of = (ticket, Peer::from(peer));
+        let line = SharedLine::new(Arc::clone(&front), of, Box::new(stream), due);
+        let (_stop, stopping) = watch::channel(false);
+        let mut serving = pin!(converse(&front, &line, stopping));
+        client.write_all(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n").unwrap();
+        let event = tokio::select! {
+            _ = &mut serving => unreachable!("there is no response"),
+            event = async { loop { match inbox.take().pop() { Some(event) => break event, None => yield_now().await } } } => event,
+        };
+        let Event::Request { exchange, .. } = event else { unreachable!("{event:?}") };
+        // From here on, the connection is not served.
+        assert!(exchange.watch_client());
+        client.write_all(b"GET / HT").unwrap();
+        assert!(exchange.watch_client(), "it has begun its next request");
+        client.shutdown(Shutdown::Write).unwrap();
+        assert!(!exchange.watch_client());
+    });
 }

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Mutex, MutexGuard, Weak};
 use std::task::{Context, Poll, Waker};
 
 use bytes::Bytes;
@@ -81,10 +81,19 @@ pub enum Event {
     Room { number: u64 },
 }
 
+/// The bytes of a connection, for any thread.
+pub(super) trait LooksForEnd: Send {
+    /// Reads ahead. Returns whether the client sends no more.
+    fn look_for_end(&mut self) -> bool;
+}
+
+pub(super) type WeakConnection = Weak<Mutex<dyn LooksForEnd>>;
+
 #[derive(Debug)]
 pub struct Exchange {
     pub number: u64,
     inbox: Arc<Inbox<Event>>,
+    connection: WeakConnection,
     state: Mutex<State>,
 }
 
@@ -117,8 +126,12 @@ pub enum Sent {
 }
 
 impl Exchange {
-    pub(super) fn new(number: u64, inbox: Arc<Inbox<Event>>) -> Arc<Exchange> {
-        Arc::new(Exchange { number, inbox, state: Mutex::default() })
+    pub(super) fn new(
+        number: u64,
+        inbox: Arc<Inbox<Event>>,
+        connection: WeakConnection,
+    ) -> Arc<Exchange> {
+        Arc::new(Exchange { number, inbox, connection, state: Mutex::default() })
     }
 
     /// Asks for the body of the request.
@@ -141,11 +154,19 @@ impl Exchange {
         }
     }
 
-    /// From now on, a client that sends no more counts as gone: a full close looks the same.
-    pub fn watch_client(&self) {
-        let mut state = lock(&self.state);
-        state.leaves = true;
+    /// Whether the client is still there, by what the system has received until now: the thread of the connection
+    /// may notice an end later, as after a standstill. From now on, a client that sends no more counts as gone: a
+    /// full close looks the same.
+    pub fn watch_client(&self) -> bool {
+        lock(&self.state).leaves = true;
+        let is_there = match self.connection.upgrade() {
+            Some(connection) => !lock(&connection).look_for_end(),
+            None => false,
+        };
+        let state = lock(&self.state);
+        let is_there = is_there && !state.is_over;
         wake(state);
+        is_there
     }
 
     /// Answers the request with a stream. From now on, a client that sends no more counts as gone: a

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use ipnet::IpNet;
 
-use super::exchange::{Event, Exchange};
+use super::exchange::{Event, Exchange, WeakConnection};
 use super::inbox::Inbox;
 use super::refusal::{Refusal, RefusalBody};
 use crate::server::Peer;
@@ -79,9 +79,10 @@ impl Front {
         self.inbox.wake();
     }
 
-    /// A new exchange.
-    pub(super) fn exchange(&self) -> Arc<Exchange> {
-        Exchange::new(self.next.fetch_add(1, Ordering::Relaxed), Arc::clone(&self.inbox))
+    /// A new exchange of a connection.
+    pub(super) fn exchange(&self, connection: WeakConnection) -> Arc<Exchange> {
+        let number = self.next.fetch_add(1, Ordering::Relaxed);
+        Exchange::new(number, Arc::clone(&self.inbox), connection)
     }
 }
 

@@ -11,7 +11,7 @@ use hyper::rt::{Read, ReadBufCursor, Write};
 use socket2::SockRef;
 use tokio::time::Sleep;
 
-use super::exchange::{Exchange, Order};
+use super::exchange::{Exchange, LooksForEnd, Order, WeakConnection};
 use super::front::Front;
 use super::refusal::{self, Refusal};
 use super::request_bytes::{ChunksEnd, HeadEnd, Portion};
@@ -79,7 +79,7 @@ pub(super) struct Line {
 }
 
 /// The line, shared by hyper, the handler's response and the task of the connection. They all run in one
-/// task, so nobody waits for the lock.
+/// task, so nobody waits for the lock, unless a handler looks for the end at the same moment.
 #[derive(Clone)]
 pub(super) struct SharedLine(Arc<Mutex<Line>>);
 
@@ -138,6 +138,11 @@ impl SharedLine {
 
     pub(super) fn lock(&self) -> MutexGuard<'_, Line> {
         lock(&self.0)
+    }
+
+    pub(super) fn downgrade(&self) -> WeakConnection {
+        let line: Arc<Mutex<dyn LooksForEnd>> = self.0.clone();
+        Arc::downgrade(&line)
     }
 
     /// The line, when hyper and the response are done with it.
@@ -310,15 +315,19 @@ impl Line {
                 // A record of TLS without data.
                 Ok(0) => {}
                 Ok(len) => {
-                    self.held.drain(..self.taken);
-                    self.taken = 0;
-                    self.held.extend_from_slice(&input[..len]);
+                    self.hold(&input[..len]);
                     return Poll::Ready(Ok(len));
                 }
                 Err(End::ByPeer) => return Poll::Ready(Ok(0)),
                 Err(end) => return Poll::Ready(Err(end)),
             }
         }
+    }
+
+    fn hold(&mut self, received: &[u8]) {
+        self.held.drain(..self.taken);
+        self.taken = 0;
+        self.held.extend_from_slice(received);
     }
 
     fn note_received(&mut self) {
@@ -336,11 +345,7 @@ impl Line {
     /// While a request is answered: reads what the peer sends ahead, so that its end is noticed.
     /// Returns whether the connection is broken.
     pub(super) fn poll_ahead(&mut self, context: &mut Context<'_>) -> bool {
-        while self.is_busy()
-            && self.portion.is_over()
-            && !self.is_ended
-            && self.held.len() - self.taken < CHUNK_BYTES
-        {
+        while self.reads_ahead() {
             match self.poll_fill(context) {
                 Poll::Ready(Ok(_)) => {}
                 Poll::Ready(Err(_)) => return true,
@@ -348,6 +353,13 @@ impl Line {
             }
         }
         false
+    }
+
+    fn reads_ahead(&self) -> bool {
+        self.is_busy()
+            && self.portion.is_over()
+            && !self.is_ended
+            && self.held.len() - self.taken < CHUNK_BYTES
     }
 
     /// Ready when a deadline has passed: the connection ends.
@@ -446,6 +458,22 @@ impl Line {
             self.note_waiting();
         }
         Poll::Ready(Ok(()))
+    }
+}
+
+impl LooksForEnd for Line {
+    /// As `poll_ahead`, and also what the runtime has not reported yet.
+    fn look_for_end(&mut self) -> bool {
+        INPUT.with_borrow_mut(|input| {
+            while self.reads_ahead()
+                && let Some(len @ 1..) = self.stream.read_now(input, &mut self.unsent)
+            {
+                self.hold(&input[..len]);
+                self.note_received();
+            }
+        });
+        self.is_ended |= self.stream.has_ended();
+        self.is_ended
     }
 }
 

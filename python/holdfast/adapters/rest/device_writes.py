@@ -1,7 +1,8 @@
 """Writes that go to devices in place of a memory: each waits for its turn and for the answer.
 
-A write that was not sent yet is withdrawn when its client has gone, and when the server ends. One
-that was sent is waited for, and recorded with the answer of the device.
+A write that was not sent yet is withdrawn when its client has gone, also while the process was
+stopped, and when the server ends. One that was sent is waited for, and recorded with the answer of
+the device.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class DeviceWrites:
             async with self._opening:
                 self._calls = self._calls or await Calls.opened()
         calls = self._calls
-        if self._is_ending:
+        if self._is_ending or not request.is_client_there():
             raise _withdrawn(begun)
         ticket = self._memory_access.call_device(begun, calls.caller)
         answer = calls.result(ticket)

@@ -147,6 +147,14 @@ class Request:
         """
         raise NotImplementedError
 
+    def is_client_there(self) -> bool:
+        """Whether the client is still connected, by what the system knows now. Thread-safe.
+
+        `when_gone` may call its function later, as after the process was stopped. The body must
+        have been read, and a half-close means the same as there.
+        """
+        raise NotImplementedError
+
     async def begin(self, status: int, headers: Headers) -> None:
         """Begins a stream. From here on, a half-close of the client means that it is gone."""
         raise NotImplementedError

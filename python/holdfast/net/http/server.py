@@ -412,8 +412,7 @@ class _ServerRequest(Request):
             self._waiter.set_result((kind, value))
         if kind == "gone":
             self._is_gone = True
-            if self._when_gone is not None:
-                self._when_gone()
+            self._report_gone()
 
     async def receive(self, most: int) -> bytes:
         """Waits for the body, and for the turn of a large one."""
@@ -439,10 +438,18 @@ class _ServerRequest(Request):
     def when_gone(self, function: Callable[[], object] | None) -> None:
         """Sets the function to call when the client disconnects; `None` removes it."""
         self._when_gone = function
+        if function is not None and not self.is_client_there():
+            self._report_gone()
+
+    def is_client_there(self) -> bool:
+        """Whether the client is still connected. Thread-safe."""
+        return not self._is_gone and self.exchange.watch_client()
+
+    def _report_gone(self) -> None:
+        """Calls the function of `when_gone` once."""
+        function, self._when_gone = self._when_gone, None
         if function is not None:
-            self.exchange.watch_client()
-            if self._is_gone:
-                function()
+            function()
 
     async def begin(self, status: int, headers: Headers) -> None:
         """Begins a stream."""

@@ -1,6 +1,7 @@
 //! The stream of a connection: a socket, or TLS over a socket.
 
 use std::io::{self, ErrorKind, Read, Write};
+use std::mem::MaybeUninit;
 use std::pin::pin;
 use std::task::{Context, Poll, ready};
 use std::time::Duration;
@@ -53,6 +54,12 @@ pub(crate) trait Stream: Send {
 
     /// Reads once what the system has already received; `None` when there is no more.
     fn read_now(&mut self, input: &mut [u8], unsent: &mut Vec<u8>) -> Option<usize>;
+
+    /// Whether nothing follows what was read with [`Stream::read_now`]: the peer has ended its side, or the
+    /// connection is broken.
+    fn has_ended(&self) -> bool {
+        has_ended(self.socket())
+    }
 
     /// Sends as much as the system accepts without blocking.
     fn send(&mut self, output: &[u8], unsent: &mut Vec<u8>) -> Result<(), Kind>;
@@ -160,6 +167,14 @@ pub(crate) fn poll_end(socket: &TcpStream, context: &mut Context<'_>) -> Poll<Ki
 /// Reads directly from the system, even if the runtime does not report the socket as readable.
 pub(crate) fn read(socket: &TcpStream, input: &mut [u8]) -> Option<usize> {
     (&*SockRef::from(socket)).read(input).ok().filter(|len| *len > 0)
+}
+
+/// Asks the system, as [`read`] does, whether there is nothing more to read, and never will be.
+pub(crate) fn has_ended(socket: &TcpStream) -> bool {
+    match SockRef::from(socket).peek(&mut [MaybeUninit::uninit()]) {
+        Ok(len) => len == 0,
+        Err(error) => !matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted),
+    }
 }
 
 /// Sends all of `unsent` without waiting, or fails. Clears it in both cases.

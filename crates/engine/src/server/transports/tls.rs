@@ -181,6 +181,11 @@ impl Stream for ServerTlsStream {
         })
     }
 
+    fn has_ended(&self) -> bool {
+        let has_read_all = self.taken == self.plain.len();
+        has_read_all && (self.ended.is_some() || stream::has_ended(&self.socket))
+    }
+
     fn send(&mut self, output: &[u8], unsent: &mut Vec<u8>) -> Result<(), Kind> {
         SCRATCH.with_borrow_mut(|Scratch { output: records, .. }| {
             records.clear();
@@ -257,6 +262,7 @@ mod tests {
     use {
         crate::tls::test_party::{self, Party},
         rustls::version::{TLS12, TLS13},
+        std::io::Write,
         std::net::TcpStream as Blocking,
         tokio::net::TcpListener,
     };
@@ -289,6 +295,37 @@ mod tests {
             });
             assert!(is_prompt, "{version:?}");
         }
+    }
+
+    #[cfg(target_os = "linux")]
+    #[test]
+    fn the_end_that_a_peer_announces_is_found_behind_what_it_has_sent() {
+        let party = Party::new();
+        let tls = ServerTls::load(&party.files(), None).unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(async {
+            let listener = TcpListener::bind(("127.0.0.1", 0)).await.unwrap();
+            let mut client = Blocking::connect(listener.local_addr().unwrap()).unwrap();
+            let (socket, _) = listener.accept().await.unwrap();
+            let mut stream = ServerTlsStream::new(socket, &tls).unwrap();
+            let config = party.client(&TLS13);
+            let shaking = std::thread::spawn(move || {
+                let mut channel = test_party::connection(&config);
+                channel.complete_io(&mut client).unwrap();
+                (channel, client)
+            });
+            stream.handshake(Duration::from_secs(60)).await.unwrap();
+            let (mut channel, mut client) = shaking.join().unwrap();
+            channel.writer().write_all(b"four").unwrap();
+            channel.write_tls(&mut client).unwrap();
+            let (mut input, mut unsent) = ([0; 9], Vec::new());
+            assert_eq!(stream.read_now(&mut input, &mut unsent), Some(4));
+            assert!(!stream.has_ended());
+            channel.send_close_notify();
+            channel.write_tls(&mut client).unwrap();
+            assert_eq!(stream.read_now(&mut input, &mut unsent), Some(0));
+            assert!(stream.has_ended(), "the socket is still open");
+        });
     }
 
     #[test]
