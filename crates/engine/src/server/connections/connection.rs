@@ -29,7 +29,9 @@ use crate::server::connections::worker_share::{Share, WORK_OF_READ};
 use crate::server::reports::event::Kind;
 use crate::server::reports::refused_request::Reported;
 use crate::server::requests::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
+use crate::server::rights::functions::only_reads;
 use crate::server::rights::peer_rights::PeerRights;
+use crate::server::rights::rule::RequestDestination;
 use crate::server::transports::framing::{Ascii, Framing, Mbap, Next, Rtu};
 use crate::server::transports::stream::{self, Stream};
 
@@ -98,6 +100,9 @@ pub(crate) struct Connection<F: Framing, S> {
     has_read_all: bool,
     share: Share,
 }
+
+/// Whether the peer is still there, by what the system has received behind the bytes that were read.
+type IsThere<'a> = &'a dyn Fn() -> bool;
 
 /// The state that replies depend on.
 struct Answering<F: Framing> {
@@ -282,7 +287,8 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             ready!(self.renew())?;
             self.answering.gives_up =
                 !F::HAS_IDS && self.answering.is_waiting() && self.deadlines.has_given_up();
-            let answered = self.answering.answer(&input[..partial + read], output);
+            let is_there = || !self.stream.has_ended();
+            let answered = self.answering.answer(&is_there, &input[..partial + read], output);
             self.note_answered(&answered);
             let output = &output[..answered.len];
             if !output.is_empty() {
@@ -302,7 +308,8 @@ impl<F: Framing, S: Stream + 'static> Connection<F, S> {
             self.reads_in_turn += 1;
             if self.answering.behind() > 0 {
                 ready!(self.renew())?;
-                let (written, taken) = self.answering.resume(&mut output[len..]);
+                let is_there = || !self.stream.has_ended();
+                let (written, taken) = self.answering.resume(&is_there, &mut output[len..]);
                 len += written;
                 self.share.charge(taken);
             }
@@ -462,8 +469,9 @@ impl<F: Framing> Answering<F> {
         self.partial.len()
     }
 
-    /// Answers the complete requests of `input`, and keeps the incomplete one after them.
-    fn answer(&mut self, input: &[u8], output: &mut [u8]) -> Answered {
+    /// Answers the complete requests of `input`, and keeps the incomplete one after them. Writes to devices are
+    /// only sent on their way while the peer `is_there`.
+    fn answer(&mut self, is_there: IsThere<'_>, input: &[u8], output: &mut [u8]) -> Answered {
         let mut answered =
             Answered { len: 0, requests: 0, discarded: 0, consumed: 0, broken: false };
         let mut rest = input;
@@ -477,7 +485,12 @@ impl<F: Framing> Answering<F> {
                     rest = &rest[len..];
                     answered.requests += 1;
                     let room = &mut output[answered.len..];
-                    answered.len += self.handle_request((tag, unit_id, pdu), room);
+                    let request = (tag, unit_id, pdu);
+                    let Some(reply) = self.handle_request(is_there, request, room) else {
+                        rest = &[];
+                        break;
+                    };
+                    answered.len += reply;
                 }
                 Next::Foreign { len } => {
                     rest = &rest[len..];
@@ -504,16 +517,26 @@ impl<F: Framing> Answering<F> {
     }
 
     /// Answers a request now, or sends it on its way, or keeps it until others are answered. Returns the length
-    /// of the framed reply, 0 when there is none, or none yet.
+    /// of the framed reply, 0 when there is none, or none yet; `None` if its peer has ended: it and all behind it
+    /// are dropped.
     // Otherwise, each request would be passed on through memory.
     #[inline(always)]
     fn handle_request(
         &mut self,
+        is_there: IsThere<'_>,
         (tag, unit_id, pdu): (u16, u8, &[u8]),
         output: &mut [u8],
-    ) -> usize {
+    ) -> Option<usize> {
         let destination = self.unit_server.destination(&self.rights, unit_id, pdu);
         if destination.is_some() || self.deferred.is_some() {
+            // After a standstill, a request and the end of its peer are received together. A device may be faster
+            // than the next read, which finds the end.
+            let is_write = destination.is_some_and(RequestDestination::is_device)
+                && !only_reads(pdu)
+                && !(F::HAS_BROADCASTS && unit_id == 0);
+            if is_write && !is_there() {
+                return None;
+            }
             let deferred = self.deferred.get_or_insert_default();
             let ours = (&*self.unit_server, &*self.rights, &*self.context);
             let request = (tag, unit_id, pdu);
@@ -522,19 +545,22 @@ impl<F: Framing> Answering<F> {
                 deferred.defer(ours, destination, peer, F::HAS_IDS, request)
             {
                 self.context.note_refused(refused, &self.reported, Some(&self.peer));
-                return 0;
+                return Some(0);
             }
         }
-        self.reply(tag, unit_id, pdu, output)
+        Some(self.reply(tag, unit_id, pdu, output))
     }
 
     /// Answers the requests that waited for others, as far as they need not wait any more. Returns the length of
     /// the output, and the number of those requests.
-    fn resume(&mut self, output: &mut [u8]) -> (usize, u32) {
+    fn resume(&mut self, is_there: IsThere<'_>, output: &mut [u8]) -> (usize, u32) {
         let behind = self.deferred.as_mut().map(|deferred| deferred.resume()).unwrap_or_default();
         let (mut rest, mut written, mut taken) = (&behind[..], 0, 0);
         while let mbap::Next::Frame { transaction_id, unit_id, pdu, len } = mbap::next(rest) {
-            written += self.handle_request((transaction_id, unit_id, pdu), &mut output[written..]);
+            let request = (transaction_id, unit_id, pdu);
+            let room = &mut output[written..];
+            let Some(reply) = self.handle_request(is_there, request, room) else { break };
+            written += reply;
             rest = &rest[len..];
             taken += 1;
         }
@@ -645,7 +671,8 @@ impl<F: Framing> Answering<F> {
                 }
                 let partial = self.restore(input);
                 let Some(len) = stream.read_now(&mut input[partial..], unsent) else { break };
-                let answered = self.answer(&input[..partial + len], output);
+                let is_there = || !stream.has_ended();
+                let answered = self.answer(&is_there, &input[..partial + len], output);
                 let output = &output[..answered.len];
                 if !output.is_empty() && stream.send(output, unsent).is_err() {
                     break;
@@ -662,14 +689,19 @@ impl<F: Framing> Answering<F> {
 
 #[cfg(test)]
 mod tests {
-    use std::io::{Read, Write};
+    use std::io::{Read as _, Write};
     use std::net::SocketAddr;
     use std::time::Duration;
 
-    use holdfast_memory::{Area, Contents, Layout, Memory, Span};
+    use holdfast_memory::{Access, Area, Contents, Layout, Memory, Read, Span};
     use holdfast_protocol::frame::{ascii, mbap, rtu};
 
+    use holdfast_runtime::Retry;
+    use tokio::sync::mpsc;
+
     use super::*;
+    use crate::client::Place;
+    use crate::link::{InFlight, LinkSettings, Route, SharedLink};
     use crate::server::connections::admission::{Admission, ConnectionLimits};
     use crate::server::requests::identity::Identity;
     use crate::server::requests::unit_server::UnitSettings;
@@ -690,7 +722,11 @@ mod tests {
     }
 
     fn answering_with<F: Framing>(memory: Arc<Memory>) -> Answering<F> {
-        let rule = Rule {
+        answering_by(&rule(memory))
+    }
+
+    fn rule(memory: Arc<Memory>) -> Rule {
+        Rule {
             sources: Vec::new(),
             roles: None,
             units: vec![(1, memory)],
@@ -698,14 +734,17 @@ mod tests {
             access: AccessMode::ReadWrite,
             functions: Functions::All,
             narrowed: Vec::new(),
-        };
+        }
+    }
+
+    fn answering_by<F: Framing>(rule: &Rule) -> Answering<F> {
         let objects = [(0, b"a".to_vec()), (1, b"b".to_vec()), (2, b"c".to_vec())];
         let identity = Identity::new(&objects, &[]).unwrap();
         Answering::new(
             Arc::new(ListenerContext::for_tests()),
             Peer::from(SocketAddr::from(([127, 0, 0, 1], 1))),
             Arc::new(UnitServer::new(identity, UnitSettings::default())),
-            Arc::new(PeerRights::new(&rule)),
+            Arc::new(PeerRights::new(rule)),
         )
     }
 
@@ -763,10 +802,10 @@ mod tests {
 
     fn allocates_nothing<F: Framing>(input: &[u8]) {
         let (mut answering, mut output) = (answering::<F>(), vec![0; OUTPUT_BYTES]);
-        answering.answer(input, &mut output);
+        answering.answer(&|| true, input, &mut output);
         let mut requests = 0;
         let allocations = allocation_counter::measure(|| {
-            requests = answering.answer(input, &mut output).requests;
+            requests = answering.answer(&|| true, input, &mut output).requests;
         });
         assert_eq!(requests, 17);
         assert_eq!(allocations.count_total, 0);
@@ -785,7 +824,7 @@ mod tests {
         for piece in pieces {
             let partial = answering.restore(&mut input);
             input[partial..partial + piece.len()].copy_from_slice(piece);
-            let answered = answering.answer(&input[..partial + piece.len()], output);
+            let answered = answering.answer(&|| true, &input[..partial + piece.len()], output);
             replies.extend_from_slice(&output[..answered.len]);
             broken = answered.broken;
             if broken {
@@ -853,6 +892,46 @@ mod tests {
     }
 
     #[test]
+    fn a_write_to_a_device_is_not_sent_on_its_way_once_its_peer_has_ended() {
+        let place = Place::Tcp { host: "127.0.0.1".into(), port: 502, tls: None };
+        let settings = LinkSettings {
+            endpoint: place.into(),
+            in_flight: InFlight::Fixed(1),
+            retry: Retry::default(),
+            queue: LinkSettings::QUEUE,
+            coalesce: true,
+            cache: Duration::ZERO,
+            preferred: Vec::new(),
+        };
+        let (calls, mut called) = mpsc::unbounded_channel();
+        let route = Route {
+            name: "plc".into(),
+            link: Arc::new(SharedLink::new(&settings, calls)),
+            unit_id: None,
+            timeout: Duration::from_secs(1),
+            withdrawal: Arc::default(),
+        };
+        let (memory, mut register) = (memory(), [0; 2]);
+        let mut rule = rule(Arc::clone(&memory));
+        rule.destinations = vec![(2, RequestDestination::Device(route))];
+        let mut output = vec![0; OUTPUT_BYTES];
+        for (pdu, is_there, is_sent) in [
+            (&[6, 0, 0, 0, 7][..], false, false),
+            (&[6, 0, 0, 0, 7], true, true),
+            (&[3, 0, 0, 0, 1], false, true),
+        ] {
+            let mut answering = answering_by::<Mbap>(&rule);
+            let input = [frame(2, pdu), frame(1, &[6, 0, 0, 0, 9])].concat();
+            answering.answer(&|| is_there, &input, &mut output);
+            assert_eq!(called.try_recv().is_ok(), is_sent, "{pdu:?}");
+            let read =
+                Read { area: Area::HoldingRegisters, address: 0, count: 1, out: &mut register };
+            memory.read(Access::Client, read).unwrap();
+            assert_eq!(register, [0; 2], "{pdu:?}: what follows waits, or is dropped too");
+        }
+    }
+
+    #[test]
     fn rtu_after_a_silence_is_never_part_of_what_came_before() {
         let mut output = vec![0; OUTPUT_BYTES];
         let read = rtu_frame(1, &[3, 0, 0, 0, 1]);
@@ -864,12 +943,12 @@ mod tests {
         let lost = [&damaged[..], &[0; 12]].concat();
         for before in [begun, swallowed, damaged, lost, rtu_frame(1, &[99]), vec![0x64; 300]] {
             let mut answering = answering::<Rtu>();
-            let first = answering.answer(&before, &mut output);
+            let first = answering.answer(&|| true, &before, &mut output);
             let replies = rtu_frame(1, &[99]) == before;
             assert_eq!(first.len > 0, replies, "{before:02x?}");
             answering.discard_partial();
             assert!(answering.partial.is_empty());
-            let len = answering.answer(&read, &mut output).len;
+            let len = answering.answer(&|| true, &read, &mut output).len;
             assert_eq!(output[..len], answer, "{before:02x?}");
         }
     }
@@ -982,13 +1061,13 @@ mod tests {
     fn the_output_has_room_for_the_replies_to_any_input() {
         let shortest = frame(1, &[17]);
         let input = shortest.repeat(INPUT_BYTES / shortest.len());
-        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        let answered = answering::<Mbap>().answer(&|| true, &input, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!(answered.requests, INPUT_BYTES / Mbap::MIN_FRAME_LEN);
         assert!(answered.requests * mbap::MAX_LEN <= OUTPUT_BYTES);
 
         let shortest = ascii_frame(1, &[17]);
         let input = shortest.repeat(INPUT_BYTES / shortest.len());
-        let answered = answering::<Ascii>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        let answered = answering::<Ascii>().answer(&|| true, &input, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!(answered.requests, INPUT_BYTES / Ascii::MIN_FRAME_LEN);
         assert!(answered.requests * ascii::MAX_LEN <= OUTPUT_BYTES);
     }
@@ -997,7 +1076,8 @@ mod tests {
     fn the_longest_ascii_reply_is_encoded_in_place() {
         let longest = [&[8, 0, 0][..], &[0xA5; 250]].concat();
         let mut output = vec![0; OUTPUT_BYTES];
-        let answered = answering::<Ascii>().answer(&ascii_frame(1, &longest), &mut output);
+        let answered =
+            answering::<Ascii>().answer(&|| true, &ascii_frame(1, &longest), &mut output);
         assert_eq!(output[..answered.len], ascii_frame(1, &longest));
         assert_eq!(answered.len, ascii::MAX_LEN);
     }
@@ -1008,18 +1088,18 @@ mod tests {
         let damaged =
             |answering: &Answering<Ascii>| answering.unit_server.counters.frames.damaged.get();
         let line = [b":".to_vec(), vec![b'0'; INPUT_BYTES - 1]].concat();
-        let answered = answering.answer(&line, &mut vec![0; OUTPUT_BYTES]);
+        let answered = answering.answer(&|| true, &line, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answered.consumed, answering.partial.len()), (INPUT_BYTES, 0));
         assert_eq!(damaged(&answering), 1);
 
-        answering.answer(&line[..ascii::MAX_LEN - 1], &mut vec![0; OUTPUT_BYTES]);
+        answering.answer(&|| true, &line[..ascii::MAX_LEN - 1], &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answering.partial.len(), damaged(&answering)), (ascii::MAX_LEN - 1, 1));
     }
 
     #[test]
     fn requests_before_a_broken_frame_are_answered_and_none_after_it() {
         let input = [frame(1, &[17]), vec![0, 0, 0, 0, 1, 0, 1, 17], frame(1, &[17])].concat();
-        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        let answered = answering::<Mbap>().answer(&|| true, &input, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answered.requests, answered.broken), (1, true));
     }
 
@@ -1036,7 +1116,8 @@ mod tests {
             for part in [&input[..cut], &input[cut..]] {
                 let partial = shared.restore(&mut buffer);
                 buffer[partial..partial + part.len()].copy_from_slice(part);
-                let answered = shared.answer(&buffer[..partial + part.len()], &mut output);
+                let answered =
+                    shared.answer(&|| true, &buffer[..partial + part.len()], &mut output);
                 requests += answered.requests;
                 broken |= answered.broken;
                 if answered.broken {
@@ -1049,17 +1130,19 @@ mod tests {
         }
         // A version that is wrong makes no difference: its sender takes it for a packet too.
         let input = [&frame(1, &[17])[..], b"RI\x02\x03\x00\x02\x00\x00\x00\x06", &write].concat();
-        let answered = answering::<MbapBesidePackets>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        let answered =
+            answering::<MbapBesidePackets>().answer(&|| true, &input, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answered.requests, answered.broken), (1, true));
         // Frames of other protocols, and transaction ids like the start of a packet, are as before.
         let foreign = [0x52, 0x48, 2, 1, 0, 2, 1, 17];
         let mut harmless = frame(1, &[17]);
         harmless[..2].copy_from_slice(b"RI");
         let input = [&foreign[..], &harmless].concat();
-        let answered = answering::<MbapBesidePackets>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        let answered =
+            answering::<MbapBesidePackets>().answer(&|| true, &input, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answered.requests, answered.broken), (1, false));
         let input = [b"RI\x01\x09\x00\x02\x01\x11", &frame(1, &[17])[..]].concat();
-        let answered = answering::<Mbap>().answer(&input, &mut vec![0; OUTPUT_BYTES]);
+        let answered = answering::<Mbap>().answer(&|| true, &input, &mut vec![0; OUTPUT_BYTES]);
         assert_eq!((answered.requests, answered.broken), (1, false), "no packets at this port");
     }
 }

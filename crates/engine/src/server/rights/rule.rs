@@ -50,6 +50,11 @@ pub enum RequestDestination {
 }
 
 impl RequestDestination {
+    /// Whether requests are sent to a device.
+    pub(crate) fn is_device(&self) -> bool {
+        matches!(self, RequestDestination::Device(_) | RequestDestination::Mirror(_))
+    }
+
     /// The memory of the unit; `None` if it is a device.
     pub(crate) fn memory(&self) -> Option<&Memory> {
         match self {
