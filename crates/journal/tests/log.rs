@@ -16,7 +16,7 @@ use holdfast_memory::{
     Span, Step, StepWrite, Tenure, Term, Write, write_across,
 };
 use nodes::process::{Answer, Process};
-use nodes::{Folder, Node, REGISTERS, Server, cluster, free_port, memory_of, until};
+use nodes::{Folder, Node, REGISTERS, Server, cluster, free_port, introduced, memory_of, until};
 
 fn step(address: u16, value: u16) -> Step {
     let write = StepWrite {
@@ -594,6 +594,24 @@ fn parts_of_a_snapshot_are_as_small_as_the_servers_accept() {
     let node = Node::with(memory_of(65_536), &[&server], "a", |_| ());
     node.start();
     node.write(0, 1).unwrap();
+}
+
+#[test]
+fn nothing_is_made_on_a_server_that_is_too_old() {
+    let server = Server::new();
+    let old = introduced(&server, "version", &serde_json::json!("2.9.25"));
+    let node = || Node::new(&[], "a", |settings| settings.servers.urls = vec![old.clone()]);
+    let needed = "the server is nats-server 2.9.25: a log requires 2.10 or newer".to_owned();
+    assert_eq!(node().try_start(), Err(LogError::Settings(needed)));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+    runtime.block_on(async {
+        let client = async_nats::connect(server.url()).await.unwrap();
+        let jetstream = async_nats::jetstream::new(client);
+        assert_eq!(jetstream.stream_names().count().await, 0);
+    });
+    // A leaf node may be older than the servers that have the log.
+    drop(Node::started(&[&server], "b"));
+    node().start();
 }
 
 /// The subjects of all that the bucket of the snapshots has.

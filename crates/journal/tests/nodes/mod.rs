@@ -4,7 +4,8 @@
 
 pub mod process;
 
-use std::net::TcpListener;
+use std::io::{BufRead, BufReader, Write as _};
+use std::net::{Shutdown, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
@@ -167,6 +168,50 @@ impl Drop for Server {
     }
 }
 
+/// The URL of a proxy, until the end of the tests: what the server says of itself first is changed there.
+pub fn introduced(server: &Server, key: &'static str, value: &serde_json::Value) -> String {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let url = format!("nats://{}", listener.local_addr().unwrap());
+    let (port, value) = (server.port, value.clone());
+    std::thread::spawn(move || {
+        for near in listener.incoming().map(Result::unwrap) {
+            let Ok(far) = TcpStream::connect(("127.0.0.1", port)) else { continue };
+            let value = value.clone();
+            std::thread::spawn(move || introduce(&near, &far, key, value));
+        }
+    });
+    url
+}
+
+fn introduce(mut near: &TcpStream, far: &TcpStream, key: &str, value: serde_json::Value) {
+    let (mut far, mut line) = (BufReader::new(far), String::new());
+    if far.read_line(&mut line).unwrap_or(0) == 0 {
+        return;
+    }
+    let mut info: serde_json::Value = serde_json::from_str(&line["INFO ".len()..]).unwrap();
+    info[key] = value;
+    let _ = near.write_all(format!("INFO {info}\r\n").as_bytes());
+    std::thread::scope(|scope| {
+        let server = *far.get_ref();
+        scope.spawn(move || {
+            pump(near, server);
+            let _ = server.shutdown(Shutdown::Write);
+        });
+        pump(&mut far, near);
+        let _ = near.shutdown(Shutdown::Both);
+    });
+}
+
+/// Passes bytes on, until one of both ends.
+fn pump(mut from: impl std::io::Read, mut to: &TcpStream) {
+    let mut bytes = [0; 65_536];
+    while let Ok(len @ 1..) = from.read(&mut bytes) {
+        if to.write_all(&bytes[..len]).is_err() {
+            return;
+        }
+    }
+}
+
 /// A cluster of servers. Each knows the routes to all.
 pub fn cluster(count: usize) -> Vec<Server> {
     let ports: Vec<u16> = (0..count).map(|_| free_port()).collect();
@@ -210,8 +255,8 @@ impl Node {
         name: &str,
         change: impl FnOnce(&mut Settings),
     ) -> Node {
-        let mut settings =
-            Settings::new("site", name, servers.iter().map(|server| server.url()).collect());
+        let urls = servers.iter().map(|server| server.url()).collect();
+        let mut settings = Settings::new("site", name, urls);
         settings.write_timeout = Duration::from_secs(10);
         change(&mut settings);
         let memories = vec![("plant".to_owned(), Arc::clone(&memory))];

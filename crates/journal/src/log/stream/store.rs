@@ -4,6 +4,7 @@
 use std::collections::HashMap;
 use std::time::Duration;
 
+use async_nats::Client;
 use async_nats::jetstream::consumer::{AckPolicy, DeliverPolicy, pull};
 use async_nats::jetstream::context::{CreateStreamErrorKind, GetStreamErrorKind};
 use async_nats::jetstream::object_store::{self, ObjectMetadata, ObjectStore};
@@ -50,6 +51,9 @@ const MAX_SNAPSHOT_BYTES: u64 = 1 << 30;
 pub(in crate::log) const SNAPSHOT_KEY: &str = "snapshot";
 /// The name of a node follows.
 pub(in crate::log) const DIGEST_KEY_PREFIX: &str = "digest.";
+
+/// Older releases drop the metadata of streams, and so what tells a log from another stream.
+const MIN_SERVER: (i64, i64) = (2, 10);
 
 const META_VERSION: &str = "holdfast-version";
 const META_LAYOUT: &str = "holdfast-layout";
@@ -137,6 +141,7 @@ impl Store {
                     let text = format!("the servers have no log {:?}", settings.name);
                     return Err(LogError::Settings(text).into());
                 }
+                check_server(&context.client())?;
                 match context.create_stream(config(settings, fingerprint)).await {
                     Ok(stream) => stream,
                     // Another node was first: its fingerprint is checked below.
@@ -148,7 +153,7 @@ impl Store {
             }
             Err(error) => return Err(missing(&error)),
         };
-        check(stream.cached_info(), fingerprint)?;
+        check(stream.cached_info(), fingerprint, &context.client())?;
         let bucket = |suffix: &str| format!("{name}{suffix}");
         let pointers = keys(context, settings, bucket(""), Duration::ZERO, open_as).await?;
         let leases = match open_as {
@@ -511,12 +516,24 @@ fn is_taken(kind: &CreateStreamErrorKind) -> bool {
         if error.error_code() == ErrorCode::STREAM_NAME_EXIST)
 }
 
+fn check_server(client: &Client) -> Result<(), LogError> {
+    let (major, minor) = MIN_SERVER;
+    if client.is_server_compatible(major, minor, 0) {
+        return Ok(());
+    }
+    let found = client.server_info().version;
+    let text =
+        format!("the server is nats-server {found}: a log requires {major}.{minor} or newer");
+    Err(LogError::Settings(text))
+}
+
 /// Checks that a stream is of this version and layout.
-fn check(info: &Info, fingerprint: &str) -> Result<(), LogError> {
+fn check(info: &Info, fingerprint: &str, client: &Client) -> Result<(), LogError> {
     let metadata: &HashMap<String, String> = &info.config.metadata;
     let (Some(version), Some(layout), Some(_)) =
         (metadata.get(META_VERSION), metadata.get(META_LAYOUT), metadata.get(META_ID))
     else {
+        check_server(client)?;
         let text = format!("stream {} is not that of a log: delete it", info.config.name);
         return Err(LogError::Settings(text));
     };
