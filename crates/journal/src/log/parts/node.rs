@@ -28,6 +28,7 @@ use crate::log::parts::snapshotter::Snapshotter;
 use crate::log::settings::Settings;
 use crate::log::shared::{Checkpoint, Shared};
 use crate::log::status::Event;
+use crate::log::stream::connection::ConnectionEnd;
 
 /// How often deadlines are checked.
 pub(in crate::log) const CHECK_INTERVAL: Duration = Duration::from_millis(20);
@@ -36,6 +37,8 @@ pub(in crate::log) const CHECK_INTERVAL: Duration = Duration::from_millis(20);
 pub(in crate::log) struct Node {
     pub(in crate::log) settings: Arc<Settings>,
     pub(in crate::log) shared: Arc<Shared>,
+    /// The end of the connection of this session, if there is one.
+    pub(in crate::log) connection_end: Option<ConnectionEnd>,
     /// The layout of the memories.
     pub(in crate::log) fingerprint: String,
     pub(in crate::log) applier: Applier,
@@ -66,10 +69,12 @@ impl Node {
             fingerprint,
             settings,
             shared,
+            connection_end: None,
         }
     }
 
     pub(in crate::log) fn begin_session(&mut self) {
+        self.connection_end = None;
         self.lost_messages.begin_session();
         self.snapshotter.begin_session();
         self.comparer.begin_session();
@@ -109,15 +114,24 @@ impl Node {
         self.sender.expire(now);
     }
 
-    /// Waits for something, and meanwhile keeps the deadlines.
+    /// Waits for something, at most until the connection ends, and meanwhile keeps the deadlines.
     pub(in crate::log) async fn run_with_expiry<T>(
         &mut self,
         work: impl Future<Output = T>,
     ) -> Result<T, End> {
-        let mut work = std::pin::pin!(work);
+        let mut connection = self.connection_end.clone();
+        let ended = async {
+            match &mut connection {
+                Some(connection) => connection.wait().await,
+                None => std::future::pending().await,
+            }
+        };
+        let (mut work, mut ended) = (std::pin::pin!(work), std::pin::pin!(ended));
         loop {
             tokio::select! {
+                biased;
                 done = &mut work => return Ok(done),
+                end = &mut ended => return Err(end),
                 () = tokio::time::sleep(CHECK_INTERVAL) => {
                     self.keep_deadlines(Instant::now());
                     if self.shared.is_stopping() {
@@ -126,5 +140,25 @@ impl Node {
                 }
             }
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_waits_for_an_answer_over_a_connection_that_has_ended() {
+        let settings = Arc::new(Settings::new("site", "a", Vec::new()));
+        let shared = Arc::new(Shared::new(&settings));
+        let mut node = Node::new(settings, String::new(), shared, Vec::new());
+        let (end, connection_end) = ConnectionEnd::channel();
+        node.connection_end = Some(connection_end);
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let ended = runtime.block_on(async {
+            tokio::spawn(async move { end.send_replace(Some("it has ended".to_owned())) });
+            node.run_with_expiry(std::future::pending::<()>()).await
+        });
+        assert!(matches!(ended, Err(End::Lost(reason)) if reason == "it has ended"));
     }
 }

@@ -92,6 +92,7 @@ impl<'n> Session<'n> {
         let settings = Arc::clone(&node.settings);
         let name = format!("holdfast log {} {}", settings.name, settings.node);
         let connected = node.run_with_expiry(connect(&settings.servers, name)).await??;
+        node.connection_end = Some(connected.end.clone());
         let error = connected.error.clone();
         let begun = Session::begin(node, &settings, connected).await;
         begun.map_err(|end| end.because(error.borrow().as_deref()))
@@ -172,7 +173,7 @@ impl<'n> Session<'n> {
                         self.node.sender.report(error);
                     }
                 }
-                end = connected.end() => {
+                end = connected.end.wait() => {
                     // The message that has ended the connection comes next in the next session.
                     while let Some(Ok(received)) = messages.next_now() {
                         self.receive(&received)?;

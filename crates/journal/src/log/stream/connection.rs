@@ -34,16 +34,24 @@ const NO_RECONNECT_DELAY: Duration = Duration::from_secs(86_400);
 pub(in crate::log) struct Connected {
     pub(in crate::log) client: Client,
     pub(in crate::log) server: String,
-    ended: watch::Receiver<Option<String>>,
+    pub(in crate::log) end: ConnectionEnd,
     /// The latest error that the server has reported without an end of the connection, such as a missing
     /// permission. Requests only get no answer then.
     pub(in crate::log) error: watch::Receiver<Option<String>>,
 }
 
-impl Connected {
-    /// Waits for the end of the connection.
-    pub(in crate::log) async fn end(&mut self) -> End {
-        match self.ended.wait_for(Option::is_some).await {
+/// The end of a connection, with its reason.
+#[derive(Clone)]
+pub(in crate::log) struct ConnectionEnd(watch::Receiver<Option<String>>);
+
+impl ConnectionEnd {
+    pub(in crate::log) fn channel() -> (watch::Sender<Option<String>>, ConnectionEnd) {
+        let (sender, receiver) = watch::channel(None);
+        (sender, ConnectionEnd(receiver))
+    }
+
+    pub(in crate::log) async fn wait(&mut self) -> End {
+        match self.0.wait_for(Option::is_some).await {
             Ok(reason) => End::Lost(reason.clone().unwrap_or_default()),
             Err(_) => End::Lost("the client has ended".to_owned()),
         }
@@ -58,7 +66,7 @@ pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<C
             .map_err(|error| LogError::Settings(format!("servers: {url:?}: {error}")))?;
         addresses.push(address);
     }
-    let (sender, ended) = watch::channel(None);
+    let (sender, end) = ConnectionEnd::channel();
     let (error_sender, error) = watch::channel(None);
     let was_connected = Arc::new(AtomicBool::new(false));
     let options = login(&servers.login).await?;
@@ -115,7 +123,7 @@ pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<C
     was_connected.store(true, Ordering::Release);
     let info = client.server_info();
     let server = format!("{}:{}", info.host, info.port);
-    Ok(Connected { client, server, ended, error })
+    Ok(Connected { client, server, end, error })
 }
 
 async fn login(login: &Login) -> Result<ConnectOptions, LogError> {
