@@ -586,14 +586,107 @@ fn snapshots_for_which_there_is_no_room_leave_nothing() {
 
 #[test]
 fn parts_of_a_snapshot_are_as_small_as_the_servers_accept() {
-    let folder = nodes::Folder::new();
-    let config = folder.0.join("config");
-    std::fs::write(&config, "max_payload: 65536").unwrap();
-    let config = config.to_str().unwrap().to_owned();
-    let server = Server::with(nodes::free_port(), &["-c".to_owned(), config]);
+    let folder = Folder::new();
+    let server = server_that_accepts(&folder, 65_536);
     let node = Node::with(memory_of(65_536), &[&server], "a", |_| ());
     node.start();
     node.write(0, 1).unwrap();
+}
+
+fn server_that_accepts(folder: &Folder, max_payload: usize) -> Server {
+    let config = folder.0.join("config");
+    std::fs::write(&config, format!("max_payload: {max_payload}")).unwrap();
+    Server::with(free_port(), &["-c".to_owned(), config.to_str().unwrap().to_owned()])
+}
+
+/// A node with these registers. The server accepts messages of 8192 bytes, as for an account with this limit, and
+/// says first that it accepts more, which is all that the client takes notice of.
+fn limited(folder: &Folder, registers: u32) -> (Server, Node) {
+    let server = server_that_accepts(folder, 8192);
+    let url = introduced(&server, "max_payload", &serde_json::json!(1 << 20));
+    let node = Node::with(memory_of(registers), &[], "a", |settings| {
+        settings.servers.urls = vec![url];
+    });
+    node.start();
+    (server, node)
+}
+
+/// Whether a session has ended for a message that was too large, which has lowered the limit to 8192 bytes.
+fn has_lowered_limit(node: &Node) -> bool {
+    node.log.take_events(Duration::ZERO).iter().any(|event| {
+        event.fields.iter().any(|(key, reason)| {
+            *key == "reason"
+                && reason.starts_with("the server reports: Maximum Payload Violation: ")
+                && reason.ends_with("at most 8192 bytes in a message")
+        })
+    })
+}
+
+#[test]
+fn parts_of_a_snapshot_and_writes_fit_the_limit_of_an_account() {
+    let folder = Folder::new();
+    let (server, node) = limited(&folder, 65_536);
+    assert!(has_lowered_limit(&node));
+    let bytes = [7; 10_000];
+    let write = |count: usize| {
+        let bytes = &bytes[..count * 2];
+        node.memory.write(Access::Client, Write { area: REGISTERS, address: 0, count, bytes })
+    };
+    assert_eq!(write(3000), Ok(()));
+    let most = 8192 - 1152;
+    assert!(matches!(write(5000), Err(Refusal::TooLarge { most: at, .. }) if at == most));
+    drop(node);
+    let b = Node::with(memory_of(65_536), &[&server], "b", |_| {});
+    b.start();
+    assert_eq!((b.read(2999), b.read(3000)), (Ok(0x0707), Ok(0)));
+}
+
+#[test]
+fn steps_of_a_message_beyond_the_limit_of_an_account_are_carried_out_or_refused() {
+    const STEPS: u16 = 128;
+    let folder = Folder::new();
+    let (_server, node) = limited(&folder, 1128);
+    let (sender, receiver) = std::sync::mpsc::channel();
+    // More than the messages that may be in flight have bytes.
+    let round = |number: u16| -> usize {
+        for step in 0..STEPS {
+            let (large, marker) = ([0; 2000], number.to_be_bytes());
+            let writes = [
+                Write { area: REGISTERS, address: step, count: 1, bytes: &marker },
+                Write { area: REGISTERS, address: STEPS, count: 1000, bytes: &large },
+            ];
+            let sender = sender.clone();
+            let done = Box::new(move |outcome: Outcome| sender.send((step, outcome)).unwrap());
+            node.memory.submit(Access::Client, Operation::Write(&writes), done).unwrap();
+        }
+        let outcomes: Vec<(u16, Outcome)> = receiver.iter().take(usize::from(STEPS)).collect();
+        let mut confirmed = 0;
+        for (step, outcome) in outcomes {
+            let has_it = node.read(step) == Ok(number);
+            match outcome {
+                Ok(_) => assert!(has_it, "step {step} was confirmed"),
+                Err(refused) => {
+                    assert_eq!((refused.refusal, has_it), (Refusal::Unavailable, false))
+                }
+            }
+            confirmed += usize::from(has_it);
+        }
+        confirmed
+    };
+    let (mut number, mut confirmed) = (0, 0);
+    until("a message is too large", || {
+        number += 1;
+        confirmed += round(number);
+        has_lowered_limit(&node)
+    });
+    until("all steps are confirmed", || {
+        number += 1;
+        let of_round = round(number);
+        confirmed += of_round;
+        of_round == usize::from(STEPS)
+    });
+    assert_eq!(node.status().steps, confirmed as u64);
+    assert_eq!(node.status().not_confirmed, 0);
 }
 
 #[test]

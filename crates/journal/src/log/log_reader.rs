@@ -13,6 +13,7 @@ use super::settings::Settings;
 use super::state::{Applied, State, StreamPosition, digest_of};
 use crate::log::stream::connection::connect;
 use crate::log::stream::message::{self, MessageError, Origin};
+use crate::log::stream::message_limit::MessageLimit;
 use crate::log::stream::messages::{Fetched, fetched};
 use crate::log::stream::store::{OpenAs, Pointer, Snapshot, Store};
 
@@ -79,7 +80,7 @@ impl LogReader {
             .map_err(|error| LogError::Thread(error.to_string()))?;
         let opening = async {
             let name = format!("holdfast log replay {}", settings.name);
-            let connected = connect(&settings.servers, name).await?;
+            let connected = connect(&settings.servers, name, &MessageLimit::default()).await?;
             let context = jetstream::new(connected.client);
             let store =
                 Store::open(&context, settings, &fingerprint(&members), OpenAs::Reader).await?;

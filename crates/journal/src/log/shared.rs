@@ -15,6 +15,7 @@ use super::error::LogError;
 use super::settings::Settings;
 use super::status::{Counters, Event, NodeStatus, Phase, View};
 use super::stream::message::STEP_LEN_BYTES;
+use super::stream::message_limit::MessageLimit;
 use crate::encoding;
 
 /// The most steps that wait to be sent, and their bytes.
@@ -42,6 +43,7 @@ pub(super) struct Shared {
     contact: AtomicU64,
     /// The longest encoded step that the servers accept, in bytes.
     max_step_bytes: AtomicUsize,
+    pub(super) message_limit: MessageLimit,
     stopping: AtomicBool,
     queue: Mutex<Queue>,
     pub(super) step_arrived: Notify,
@@ -146,6 +148,7 @@ impl Shared {
             usability: AtomicU8::new(USABLE),
             contact: AtomicU64::new(0),
             max_step_bytes: AtomicUsize::new(usize::MAX),
+            message_limit: MessageLimit::default(),
             stopping: AtomicBool::new(false),
             queue: Mutex::default(),
             step_arrived: Notify::new(),

@@ -21,6 +21,7 @@ use crate::log::shared::Shared;
 use crate::log::state::State;
 use crate::log::status::Event;
 use crate::log::stream::message::{self, Notice, OVERHEAD_BYTES, Origin};
+use crate::log::stream::message_limit::MessageLimit;
 use crate::log::stream::raw_message::LOG_ID;
 use crate::log::stream::store::{subject, unique};
 
@@ -81,6 +82,7 @@ pub(in crate::log) struct Publisher {
     log_id: Option<String>,
     /// The prefix of the subjects of acknowledgements.
     inbox: String,
+    limit: MessageLimit,
     /// The most bytes of encoded steps that the servers accept in one message.
     max_steps_bytes: usize,
     timeout: Duration,
@@ -208,6 +210,10 @@ impl Sender {
     /// Sends the messages again whose outcome was not reported in earlier sessions.
     pub(in crate::log) async fn resend(&mut self, publisher: &mut Publisher) -> Result<(), End> {
         for (counter, payload) in self.in_flight.take_unanswered() {
+            // It may be the one that was too large: when the next message is applied, it never will be.
+            if !publisher.fits(&payload) {
+                continue;
+            }
             publisher.publish(&self.origin(counter), payload).await?;
         }
         Ok(())
@@ -348,15 +354,14 @@ impl Publisher {
         client: Client,
         settings: &Settings,
         log_id: Option<&str>,
+        limit: MessageLimit,
     ) -> Publisher {
         Publisher {
             subject: subject(&settings.name),
             log_id: log_id.map(str::to_owned),
             inbox: client.new_inbox(),
-            max_steps_bytes: client
-                .server_info()
-                .max_payload
-                .saturating_sub(HEADER_BYTES + OVERHEAD_BYTES),
+            max_steps_bytes: limit.bytes().saturating_sub(HEADER_BYTES + OVERHEAD_BYTES),
+            limit,
             timeout: settings.write_timeout,
             last_sent: Instant::now(),
             client,
@@ -365,6 +370,11 @@ impl Publisher {
 
     pub(in crate::log) fn max_steps_bytes(&self) -> usize {
         self.max_steps_bytes
+    }
+
+    /// Whether the servers accept a message with this payload, as far as is known.
+    fn fits(&self, payload: &Bytes) -> bool {
+        payload.len() <= self.max_steps_bytes + OVERHEAD_BYTES
     }
 
     pub(in crate::log) fn last_sent(&self) -> Instant {
@@ -385,6 +395,7 @@ impl Publisher {
             headers.insert(LOG_ID, id.as_str());
         }
         let reply = format!("{}.{}", self.inbox, origin.counter);
+        self.limit.sent(payload.len() + HEADER_BYTES);
         let published = self.client.publish_with_reply_and_headers(
             self.subject.clone(),
             reply,

@@ -91,7 +91,8 @@ impl<'n> Session<'n> {
     async fn open(node: &'n mut Node) -> Result<(Session<'n>, Sources), End> {
         let settings = Arc::clone(&node.settings);
         let name = format!("holdfast log {} {}", settings.name, settings.node);
-        let connected = node.run_with_expiry(connect(&settings.servers, name)).await??;
+        let limit = node.shared.message_limit.clone();
+        let connected = node.run_with_expiry(connect(&settings.servers, name, &limit)).await??;
         node.connection_end = Some(connected.end.clone());
         let error = connected.error.clone();
         let begun = Session::begin(node, &settings, connected).await;
@@ -108,7 +109,8 @@ impl<'n> Session<'n> {
         let from = join(node, &store).await?;
         mend_keys(node, &store).await?;
         let messages = Messages::new(&store, from);
-        let publisher = Publisher::new(connected.client.clone(), settings, store.id());
+        let limit = node.shared.message_limit.clone();
+        let publisher = Publisher::new(connected.client.clone(), settings, store.id(), limit);
         let acks = node.run_with_expiry(publisher.acknowledgements()).await??;
         let watched = [SNAPSHOT_KEY.to_owned(), format!("{DIGEST_KEY_PREFIX}>")];
         let watch = node.run_with_expiry(store.keys.watch_many_with_history(watched)).await?;

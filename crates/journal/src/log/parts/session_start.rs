@@ -98,7 +98,8 @@ async fn create_first(node: &mut Node, store: &Store) -> Result<(), End> {
     let state = node.applier.state();
     let encoded = state.encode();
     let snapshot = Snapshot::of(state, digest_of(&encoded), &node.settings.node);
-    let first = node.run_with_expiry(store.put(None, &encoded, snapshot)).await?;
+    let limit = node.shared.message_limit.clone();
+    let first = node.run_with_expiry(store.put(&limit, None, &encoded, snapshot)).await?;
     let (revision, pointer) = first.map_err(|error| End::lost("the first snapshot", error))?;
     node.snapshotter.learn(revision, pointer);
     Ok(())

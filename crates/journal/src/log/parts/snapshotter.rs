@@ -244,8 +244,9 @@ impl Snapshotter {
         let Stage::Prepared(Prepared { encoded, snapshot, .. }) = stage else { return };
         let seen = self.known.as_ref().map(|known| (known.revision, known.pointer.clone()));
         let known = seen.as_ref().map(|(revision, _)| *revision);
+        let limit = self.shared.message_limit.clone();
         background.spawn(move |store| async move {
-            let stored = store.put(seen, &encoded, snapshot).await;
+            let stored = store.put(&limit, seen, &encoded, snapshot).await;
             store.release().await;
             match stored {
                 Ok(named) => Report::Stored(named),

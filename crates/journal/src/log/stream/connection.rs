@@ -15,6 +15,7 @@ use tokio::sync::watch;
 
 use crate::log::error::{End, LogError};
 use crate::log::settings::{Login, Servers};
+use crate::log::stream::message_limit::MessageLimit;
 
 /// The most commands that wait for the connection.
 const MAX_WAITING_COMMANDS: usize = 4096;
@@ -58,7 +59,11 @@ impl ConnectionEnd {
     }
 }
 
-pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<Connected, End> {
+pub(in crate::log) async fn connect(
+    servers: &Servers,
+    name: String,
+    limit: &MessageLimit,
+) -> Result<Connected, End> {
     let mut addresses = Vec::new();
     for url in &servers.urls {
         let address: ServerAddr = url
@@ -86,6 +91,7 @@ pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<C
         }
     };
     let connected_before = Arc::clone(&was_connected);
+    let exceeded = limit.clone();
     let options = options
         .name(name)
         .connection_timeout(servers.connect_timeout)
@@ -109,19 +115,30 @@ pub(in crate::log) async fn connect(servers: &Servers, name: String) -> Result<C
                 Event::ServerError(error) => {
                     let error = error.to_string();
                     let text = error.strip_prefix("nats: ").unwrap_or(&error);
-                    error_sender.send_replace(Some(format!("the server reports: {text}")));
-                    None
+                    let reported = format!("the server reports: {text}");
+                    if text.eq_ignore_ascii_case("maximum payload violation") {
+                        Some(format!("{reported}: {}", exceeded.exceeded()))
+                    } else {
+                        error_sender.send_replace(Some(reported));
+                        None
+                    }
                 }
                 _ => None,
             };
-            if reason.is_some() {
-                sender.send_replace(reason);
-            }
+            // The first reason is the one that the others follow from.
+            sender.send_if_modified(|ended| {
+                let is_first = ended.is_none() && reason.is_some();
+                if is_first {
+                    *ended = reason;
+                }
+                is_first
+            });
             std::future::ready(())
         });
     let client = options.connect(addresses).await.map_err(|error| End::lost("connect", error))?;
     was_connected.store(true, Ordering::Release);
     let info = client.server_info();
+    limit.connected(info.max_payload);
     let server = format!("{}:{}", info.host, info.port);
     Ok(Connected { client, server, end, error })
 }

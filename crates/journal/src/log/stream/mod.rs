@@ -2,6 +2,7 @@
 
 pub(crate) mod connection;
 pub(crate) mod message;
+pub(crate) mod message_limit;
 pub(crate) mod messages;
 pub(crate) mod raw_message;
 pub(crate) mod store;

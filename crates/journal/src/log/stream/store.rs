@@ -24,6 +24,7 @@ use crate::log::layout::difference;
 use crate::log::settings::Settings;
 use crate::log::state::{State, StreamPosition, digest_of};
 use crate::log::stream::message::{FIRST_VERSION, MAX_NODES, VERSION};
+use crate::log::stream::message_limit::MessageLimit;
 use crate::log::stream::raw_message::{Received, fetch};
 
 /// Within this time, the servers themselves notice a message that was sent twice.
@@ -393,14 +394,17 @@ impl Store {
     /// Stores a snapshot and names it the newest, if the newest is still the one of `seen`.
     pub(in crate::log) async fn put(
         &self,
+        limit: &MessageLimit,
         seen: Option<(u64, Pointer)>,
         encoded: &[u8],
         mut snapshot: Snapshot,
     ) -> Result<(u64, Pointer), String> {
         snapshot.object = format!("{}-{}-{}", snapshot.sequence, snapshot.node, snapshot.object);
+        let part = MAX_PART_BYTES.min(limit.bytes());
+        limit.sent(part.min(encoded.len()));
         let object = ObjectMetadata {
             name: snapshot.object.clone(),
-            chunk_size: Some(MAX_PART_BYTES.min(self.context.client().max_payload())),
+            chunk_size: Some(part),
             ..ObjectMetadata::default()
         };
         let mut bytes = encoded;
