@@ -22,6 +22,7 @@ from support import nats_cluster, wire
 from support.brokers import NatsServer, free_port
 from support.cli import done, invoke
 from support.machine import missing
+from support.nats_keys import Operator, User
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -494,3 +495,24 @@ def test_servers_without_the_log_are_told(tmp_path: Path) -> None:
         server.kill()
     assert not (tmp_path / "backup").exists()
     assert failed("backup", file, tmp_path / "backup")
+
+
+def test_a_restore_fits_the_limit_of_an_account(tmp_path: Path) -> None:
+    alone = configuration(tmp_path)
+    with Appliance(load(alone)) as appliance:
+        for value in range(200):
+            write(appliance, 1, value)
+    done("log", "backup", str(alone), str(tmp_path / "backup"))
+    operator = Operator()
+    unlimited = dict.fromkeys(("mem_storage", "disk_storage", "streams", "consumer"), -1)
+    account = operator.account(**unlimited, payload=2048)
+    assert (tmp_path / "backup" / "holdfast-log-site").stat().st_size > 2048
+    server = NatsServer(tmp_path, "-c", str(operator.configure(tmp_path / "nats.conf")))
+    credentials = str(User(account).write(tmp_path / "node.creds"))
+    file = configuration(tmp_path, servers=[server.url], credentials_file=credentials)
+    try:
+        done("log", "restore", str(file), str(tmp_path / "backup"))
+        with Appliance(load(file)) as appliance:
+            assert register(appliance, 1) == 199
+    finally:
+        server.kill()

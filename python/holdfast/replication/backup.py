@@ -407,7 +407,8 @@ async def _send(
     client: SafeClient, name: str, subject: str, file: Path, content: dict[str, Any]
 ) -> None:
     with file.open("rb") as data:
-        while part := data.read(CHUNK_BYTES):
+        # An account may have a smaller limit than the server.
+        while part := data.read(min(CHUNK_BYTES, client.max_payload)):
             reply = await _request(client, subject, part)
             if reply.data:
                 raise BackupFailed(f"{name}: {_error(reply.data)}")
