@@ -266,13 +266,25 @@ def test_an_internal_error_of_reading_refuses_the_reload(
     assert plant.taken == []
 
 
+GATEWAY = (
+    "gateway: {bind: 127.0.0.1:0, sources: [127.0.0.1], access: read-only, allow: [127.0.0.1], "
+    "tokens: none}"
+)
+TAGS = (
+    "devices: {pump: {url: 'tcp://127.0.0.1:1', interval: 1, tags: {a: {area: coils, address: 0}}}}"
+)
+
+
+@pytest.mark.parametrize(
+    ("module", "section"),
+    [("holdfast.gateway", GATEWAY), ("holdfast.appliance.parts.tag_values", TAGS)],
+)
 def test_a_package_that_was_removed_meanwhile_refuses_the_reload(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, section: str
 ) -> None:
-    monkeypatch.setitem(sys.modules, "holdfast.gateway", None)
+    monkeypatch.setitem(sys.modules, module, None)
     plant = Plant(tmp_path)
-    gateway = "bind: 127.0.0.1:0, sources: [127.0.0.1], access: read-only, allow: [127.0.0.1]"
-    plant.replace(f"{HEAD}gateway: {{{gateway}, tokens: none}}\n")
+    plant.replace(f"{HEAD}{section}\n")
     [problem] = plant.request()["problems"]
     assert problem.startswith(f"{plant.file}: internal error: ModuleNotFoundError")
     assert plant.taken == []

@@ -92,7 +92,7 @@ class Control:
         while not self._closed.is_set():
             try:
                 connection = listener.accept()
-            except (OSError, EOFError):
+            except (OSError, EOFError, ImportError):  # An import, too, takes descriptors.
                 self._closed.wait(backoff.failed())
                 continue
             backoff.succeeded()

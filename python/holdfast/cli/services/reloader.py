@@ -55,6 +55,14 @@ class _Read:
     """Whether no watched file has changed meanwhile."""
 
 
+def _import_for(config: Config) -> None:
+    if any(device.has_tags for device in config.devices.values()):
+        import holdfast.appliance.parts.tag_values
+        import holdfast.appliance.parts.tag_writes
+    if config.adapters:
+        import holdfast.ingest.memory_access  # noqa: F401
+
+
 class Reloader:
     """Reloads one appliance with what `load` returns. `step` is for the thread that runs it.
 
@@ -143,8 +151,10 @@ class Reloader:
         before = self._watched(config, hold=True)
         try:
             now = self._load()
-            # It imports what new services need, and the package may have been replaced meanwhile.
+            # The package may have been replaced: what a new part imports fails here, where nothing
+            # has changed yet.
             allow_open_files(now, self._file)
+            _import_for(now)
         except Exception as error:  # Raised again by the thread of the appliance.
             return _Read(None, error, before)
         after = self._watched(now, hold=True)

@@ -30,40 +30,10 @@ _VOLUME = ("L", "m³", "ft³", "CCF", "MCF")
 _VOLUMES = (*_VOLUME, "mL", "gal", "fl. oz.")
 _WIND = ("m/s", "km/h", "mm/s", "m/min", "in/s", "ft/s", "mph", "kn", "Beaufort")
 
-_GENERAL = {
-    "apparent_power": ("mVA", "VA", "kVA"),
-    "current": ("mA", "A"),
-    "data_rate": (
-        *("bit/s", "kbit/s", "Mbit/s", "Gbit/s", "B/s", "kB/s", "MB/s", "GB/s"),
-        *("KiB/s", "MiB/s", "GiB/s"),
-    ),
-    "distance": ("mm", "cm", "m", "km", "in", "ft", "yd", "mi", "nmi"),
-    "duration": ("µs", "ms", "s", "min", "h", "d"),
-    "energy": _ENERGY,
-    "frequency": ("Hz", "kHz", "MHz", "GHz"),
-    "illuminance": ("lx",),
-    "irradiance": ("W/m²", "BTU/(h⋅ft²)"),
-    "power": ("mW", "W", "kW", "MW", "GW", "TW"),
-    "precipitation": ("mm", "cm", "in"),
-    "precipitation_intensity": _RAIN,
-    "pressure": _PRESSURE,
-    "reactive_power": ("mvar", "var", "kvar"),
-    "signal_strength": ("dB", "dBm"),
-    "sound_pressure": ("dB", "dBA"),
-    "speed": (*_WIND, *_RAIN),
-    "temperature": _TEMPERATURE,
-    "voltage": ("µV", "mV", "V", "kV", "MV"),
-    "volume_flow_rate": (
-        *("mL/s", "L/s", "L/min", "L/h", "m³/s", "m³/min", "m³/h"),
-        *("ft³/min", "gal/min", "gal/h", "gal/d"),
-    ),
-    "weight": ("µg", "mg", "g", "kg", "oz", "lb", "st"),
-}
-"""Device classes that a unit suggests, with their units. A unit of two of them suggests none."""
-
 _DATA = ("B", "kB", "MB", "GB", "TB", "PB", "EB", "ZB", "YB")
-_PARTICULAR: dict[str, tuple[str, ...]] = {
+_UNITS: dict[str, tuple[str, ...]] = {
     "absolute_humidity": ("mg/m³", "g/m³"),
+    "apparent_power": ("mVA", "VA", "kVA"),
     "aqi": (),
     "area": ("mm²", "cm²", "m²", "km²", "ha", "in²", "ft²", "yd²", "ac", "mi²"),
     "atmospheric_pressure": _PRESSURE,
@@ -72,14 +42,25 @@ _PARTICULAR: dict[str, tuple[str, ...]] = {
     "carbon_dioxide": ("ppm",),
     "carbon_monoxide": ("ppb", "ppm", "µg/m³", "mg/m³"),
     "conductivity": ("µS/cm", "mS/cm", "S/cm"),
+    "current": ("mA", "A"),
+    "data_rate": (
+        *("bit/s", "kbit/s", "Mbit/s", "Gbit/s", "B/s", "kB/s", "MB/s", "GB/s"),
+        *("KiB/s", "MiB/s", "GiB/s"),
+    ),
     "data_size": (
         *("bit", "kbit", "Mbit", "Gbit", *_DATA),
         *("KiB", "MiB", "GiB", "TiB", "PiB", "EiB", "ZiB", "YiB"),
     ),
+    "distance": ("mm", "cm", "m", "km", "in", "ft", "yd", "mi", "nmi"),
+    "duration": ("µs", "ms", "s", "min", "h", "d"),
+    "energy": _ENERGY,
     "energy_distance": ("Wh/km", "kWh/100km", "km/kWh", "mi/kWh"),
     "energy_storage": _ENERGY,
+    "frequency": ("Hz", "kHz", "MHz", "GHz"),
     "gas": _VOLUME,
     "humidity": ("%",),
+    "illuminance": ("lx",),
+    "irradiance": ("W/m²", "BTU/(h⋅ft²)"),
     "moisture": ("%",),
     "nitrogen_dioxide": ("ppb", "µg/m³"),
     "nitrogen_monoxide": ("ppb", "µg/m³"),
@@ -90,22 +71,59 @@ _PARTICULAR: dict[str, tuple[str, ...]] = {
     "pm10": ("µg/m³",),
     "pm25": ("µg/m³",),
     "pm4": ("µg/m³",),
+    "power": ("mW", "W", "kW", "MW", "GW", "TW"),
     "power_factor": ("%",),
+    "precipitation": ("mm", "cm", "in"),
+    "precipitation_intensity": _RAIN,
+    "pressure": _PRESSURE,
     "reactive_energy": ("varh", "kvarh"),
+    "reactive_power": ("mvar", "var", "kvar"),
+    "signal_strength": ("dB", "dBm"),
+    "sound_pressure": ("dB", "dBA"),
+    "speed": (*_WIND, *_RAIN),
     "sulphur_dioxide": ("ppb", "µg/m³"),
+    "temperature": _TEMPERATURE,
     "temperature_delta": _TEMPERATURE,
     "volatile_organic_compounds": ("µg/m³", "mg/m³"),
     "volatile_organic_compounds_parts": ("ppb", "ppm"),
+    "voltage": ("µV", "mV", "V", "kV", "MV"),
     "volume": _VOLUMES,
+    "volume_flow_rate": (
+        *("mL/s", "L/s", "L/min", "L/h", "m³/s", "m³/min", "m³/h"),
+        *("ft³/min", "gal/min", "gal/h", "gal/d"),
+    ),
     "volume_storage": _VOLUMES,
     "water": (*_VOLUME, "gal"),
+    "weight": ("µg", "mg", "g", "kg", "oz", "lb", "st"),
     "wind_direction": ("°",),
     "wind_speed": _WIND,
 }
-"""Those that a tag must name, with their units: a unit can mean another, or only newer versions of
-Home Assistant know the class, and others refuse the entity."""
+"""Device classes of numbers, with the units that they can have."""
 
-_UNITS = _GENERAL | _PARTICULAR
+_SUGGESTED = {
+    unit: device_class
+    for device_class, units in {
+        "apparent_power": ("VA",),
+        "current": ("A", "mA"),
+        "data_rate": ("bit/s", "kbit/s", "Mbit/s"),
+        "energy": ("Wh", "kWh", "MWh", "GWh", "J", "kJ", "MJ", "GJ"),
+        "frequency": ("Hz", "kHz", "MHz", "GHz"),
+        "illuminance": ("lx",),
+        "irradiance": ("W/m²",),
+        "power": ("W", "kW", "MW", "GW"),
+        "pressure": ("Pa", "hPa", "kPa", "bar", "mbar", "psi"),
+        "reactive_power": ("var",),
+        "speed": ("m/s", "km/h", "mm/s"),
+        "temperature": ("°C", "°F", "K"),
+        "voltage": ("V", "mV", "kV"),
+        "volume_flow_rate": ("m³/h", "L/min"),
+        "weight": ("kg", "g"),
+    }.items()
+    for unit in units
+}
+"""The device class of a unit that has only one, in all versions: they refuse an entity whose class
+or unit they don't know."""
+
 NUMBERS = frozenset(_UNITS) | {"monetary"}
 TEXTS = frozenset(("date", "timestamp"))
 SWITCHES = frozenset(("outlet", "switch"))
@@ -153,21 +171,18 @@ _SPELLINGS = {
 }
 """How Home Assistant spells a unit. M is never m: `Mvar` is not `mvar`."""
 
-_OF_UNIT = {
-    unit: found[0]
-    for units in _GENERAL.values()
-    for unit in units
-    if len(found := [name for name, its in _GENERAL.items() if unit in its]) == 1
-}
-
 
 def is_class_word(text: str) -> bool:
     """Whether a text can be a class of any version."""
     return re.fullmatch(r"[a-z][a-z0-9_]*", text) is not None
 
 
-def spelled(unit: str) -> str:
-    """A unit as Home Assistant spells it."""
+def unit_of(tag: Tag) -> str:
+    """The unit of an entity. If the tag names a class, it is spelled as Home Assistant does."""
+    return _spelled(tag.unit) if tag.device_class else tag.unit
+
+
+def _spelled(unit: str) -> str:
     return _SPELLINGS.get(unit, unit)
 
 
@@ -178,7 +193,7 @@ def of_number(tag: Tag) -> tuple[str, str]:
     """
     device_class = tag.device_class if takes(NUMBERS, tag.device_class) else ""
     if not device_class:
-        device_class = _OF_UNIT.get(spelled(tag.unit), "")
+        device_class = _SUGGESTED.get(tag.unit, "")
         # A class with a state class that it can't have would be the wrong one.
         if tag.state_class and not _may_be(tag.state_class, device_class):
             device_class = ""
@@ -220,7 +235,7 @@ def _flaw_of_device_class(tag: Tag, word: str) -> str | None:
     kind, known = _kind(tag)
     if word not in known:
         return f"{word} has no effect: it is no class of {kind}"
-    unit, units = spelled(tag.unit), _UNITS.get(word)
+    unit, units = _spelled(tag.unit), _UNITS.get(word)
     if kind != "numbers" or not unit or units is None or unit in units:
         return None
     allowed = either(units) if units else "none"

@@ -17,8 +17,8 @@ from holdfast.config.values.home_assistant_classes import (
     TEXTS,
     is_on_or_off,
     of_number,
-    spelled,
     takes,
+    unit_of,
 )
 from holdfast.net.addresses import address_in
 from holdfast.tags.scale import RegisterScale, linear_of
@@ -193,7 +193,7 @@ class Discovery:
         if not tag.is_number:
             return "sensor", _device_class(tag, TEXTS)
         device_class, state_class = of_number(tag)
-        own = {"unit_of_measurement": spelled(tag.unit)} if tag.unit else {}
+        own = {"unit_of_measurement": unit_of(tag)} if tag.unit else {}
         if device_class:
             own["device_class"] = device_class
         if writes and (bounds := _bounds(tag))["min"] < bounds["max"]:
