@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from nats.errors import TimeoutError as NatsTimeout
 
+from holdfast.net.nats import tolerant_client
 from holdfast.net.nats.connection import NatsConnection, Ping, Servers
 from holdfast.net.nats.key_bucket import Outdated
 from holdfast.replication.leases.bucket import SETTLED, LeaseBucket
@@ -255,6 +256,40 @@ def test_a_node_that_may_not_write_the_bucket_says_so(tmp_path: Path) -> None:
 
     try:
         make_settled(allowed, BUCKET)
+        asyncio.run(work())
+    finally:
+        server.kill()
+
+
+def test_a_node_whose_inboxes_were_forbidden_takes_its_lease_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("FIRST_REPEAT_S", "MAX_REPEAT_S"):
+        monkeypatch.setattr(tolerant_client, name, 0.05)
+    file = tmp_path / "nats.conf"
+
+    def write(denied: str) -> None:
+        user = f"{{user: a, password: a, permissions: {{subscribe: {{deny: '{denied}'}}}}}}"
+        file.write_text(f"no_auth_user: a, authorization: {{users: [{user}]}}")
+
+    write("nothing")
+    server = NatsServer(tmp_path, "-c", str(file))
+
+    async def work() -> None:
+        async with running(server.url, "a", LASTING) as node:
+            node.leases.want(["x"])
+            await until(lambda: node.leases.is_held("x"), "it has it")
+            client = node.client
+            write("_INBOX.>")
+            server.reload()
+            await until(lambda: "x" not in node.leases.held, "no answer reaches it")
+            write("nothing")
+            server.reload()
+            await until(lambda: node.leases.is_held("x"), "it has it again")
+            assert node.client is client
+
+    try:
+        make_settled(server.url, BUCKET)
         asyncio.run(work())
     finally:
         server.kill()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import json
 import logging
 import socket
 import time
@@ -13,6 +15,7 @@ from nats.aio.client import Client
 from nats.errors import FlushTimeoutError, NoRespondersError
 
 from holdfast.net.nats import connection as broker
+from holdfast.net.nats import tolerant_client
 from holdfast.net.nats.connection import Servers
 from holdfast.net.tls import Tls
 from holdfast.scanner.service import Scanner
@@ -389,6 +392,52 @@ def test_a_refused_publish_is_told_and_the_rest_works(
         status.until(lambda message: message["state"] == "online", "it is online")
     until_logged(caplog, "nats_error", 'ermissions Violation for Publish to "modbus.data.plc1"')
     assert scanner.serves
+
+
+def test_a_right_that_is_given_later_is_used(
+    run_scanner: Run,
+    serve_nats: Serve,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("FIRST_REPEAT_S", "MAX_REPEAT_S"):
+        monkeypatch.setattr(tolerant_client, name, 0.05)
+    config = tmp_path / "nats.conf"
+
+    def write(*denied: str) -> None:
+        rights = f"permissions: {{subscribe: {{deny: {json.dumps(denied)}}}}}"
+        users = f"[{{user: a, password: a, {rights}}}, {{user: b, password: b}}]"
+        config.write_text(f"authorization {{users: {users}}}")
+
+    write("modbus.browse")
+    server = serve_nats("-c", str(config))
+    scanner = run_scanner(servers=Servers((server.url.replace("//", "//a:a@"),)))
+    client = client_of(scanner.scanner)
+    wire.until(lambda: server.log.count("Subscription Violation") > 3, "it is repeated")
+    assert len(reasons(caplog, "nats_error")) == 1
+    with Caller(server.url, user="b", password="b") as caller:
+
+        def answers() -> bool:
+            with contextlib.suppress(NoRespondersError):
+                return bool(caller.request("modbus.browse", b"")["success"])
+            return False
+
+        assert not answers()
+        write()
+        server.reload()
+        wire.until(answers, "the right is used")
+        wire.until(lambda: not client._refused, "nothing more is repeated")
+        write("modbus.browse")
+        server.reload()
+        wire.until(lambda: not answers(), "the right was taken away")
+        wire.until(lambda: len(reasons(caplog, "nats_error")) == 2, "it is logged")
+        write()
+        server.reload()
+        wire.until(answers, "it was given back")
+    assert len(reasons(caplog, "nats_error")) == 2
+    assert client_of(scanner.scanner) is client
+    assert not reasons(caplog, "nats_disconnected"), "no connection has ended for that"
 
 
 REQUESTS = ("subscribe", "unsubscribe", "browse", "variables", "shutdown", "scanner")

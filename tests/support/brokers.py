@@ -90,6 +90,10 @@ class Broker(ABC):
         """Resumes the process."""
         self._signal(signal.SIGCONT)
 
+    def reload(self) -> None:
+        """Has it read its configuration again, with the access list."""
+        self._signal(signal.SIGHUP)
+
     def _signal(self, number: signal.Signals) -> None:
         assert self._process is not None
         self._process.send_signal(number)
@@ -121,10 +125,6 @@ class Mosquitto(Broker):
         lines = [f"listener {self.port} {self.host}", "user root", *self._options]
         file.write_text("\n".join(lines) + "\n")
         return [tool("mosquitto"), "-v", "-c", str(file)]
-
-    def reload(self) -> None:
-        """Has it read its configuration again, with the access list."""
-        self._signal(signal.SIGHUP)
 
     def publish(self, topic: str, message: str, *options: str) -> None:
         """Publishes with Mosquitto's own tool."""

@@ -8,9 +8,8 @@ from holdfast.scanner.fleet.placement import FleetPlacement
 from holdfast.scanner.jetstream.restore import StoredSubscriptions
 
 if TYPE_CHECKING:
-    from nats.aio.client import Client
-
     from holdfast.net.nats.connection import NatsConnection
+    from holdfast.net.nats.tolerant_client import SafeClient
     from holdfast.scanner.fleet.member import FleetMember
     from holdfast.scanner.jetstream.store import EntryStore
     from holdfast.scanner.polling.allowed_devices import AllowedDevices
@@ -26,7 +25,7 @@ def broker_of(scanner: Scanner) -> NatsConnection:
     return scanner._broker
 
 
-def client_of(scanner: Scanner) -> Client:
+def client_of(scanner: Scanner) -> SafeClient:
     """Returns its client, which is connected."""
     client = scanner._broker.client
     assert client is not None, "it is connected"

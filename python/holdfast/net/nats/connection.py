@@ -23,7 +23,7 @@ from holdfast.events import log_lines
 from holdfast.net.nats import batch
 from holdfast.net.nats.credentials import Credentials
 from holdfast.net.nats.ping_defaults import PING_INTERVAL_S, PINGS_OUTSTANDING
-from holdfast.net.nats.tolerant_client import SafeClient
+from holdfast.net.nats.tolerant_client import SafeClient, ServerError
 from holdfast.net.secret_file import read_secret
 from holdfast.net.secure_channel import SecureChannel, failure_text
 from holdfast.net.tls import NO_FILES, Tls
@@ -145,7 +145,8 @@ class NatsConnection:
         """The client while there is a connection."""
         self._subscribed = False
         self._subscriptions: list[Subscription] = []
-        self._listening: asyncio.Task[None] | None = None
+        self._works: list[asyncio.Task[None]] = []
+        """What subscribes."""
 
     @property
     def serves(self) -> bool:
@@ -174,8 +175,8 @@ class NatsConnection:
 
     async def drain(self) -> None:
         """Takes no further messages. Handlers are called for all that the server has sent."""
-        if self._listening is not None:
-            self._listening.cancel()
+        for work in self._works:
+            work.cancel()
         if self.client is not None:
             with contextlib.suppress(Error, OSError):
                 await self.client.drain_all(self._subscriptions)
@@ -217,11 +218,13 @@ class NatsConnection:
             return
         if self.client is not client and not client.is_reconnecting:  # `again` notes these.
             self._note_connected(client)
-        listening = self._listening = asyncio.create_task(self._listen(client, ended))
+        coroutines = self._listen(client, ended), client.repeat_refused()
+        works = self._works = [asyncio.create_task(each) for each in coroutines]
         try:
             await _given_up(client, ended)
         finally:
-            listening.cancel()
+            for work in works:
+                work.cancel()
         self._note_lost(client.loss_reason)
 
     async def _listen(self, client: SafeClient, ended: asyncio.Event) -> None:
@@ -273,13 +276,15 @@ class NatsConnection:
     def _note(self, client: Client, error: Exception) -> None:
         """Logs an error. Without a connection, the error is a failed attempt to connect."""
         reason, now = failure_text(error), time.monotonic()
-        if self.client is None:
+        # A server refuses subscriptions again before it is known that there is a connection again.
+        is_connected = self.client is not None or isinstance(error, ServerError)
+        if not is_connected:
             self._failed_attempts += 1
             self._pause(client, 0.0)
         if reason == self._logged_failure[0] and now - self._logged_failure[1] < LOG_INTERVAL_S:
             return
         self._logged_failure = (reason, now)
-        if self.client is not None:
+        if is_connected:
             log_lines.refused("nats_error", kind="nats", reason=reason)
             return
         attempts = self._failed_attempts

@@ -30,6 +30,7 @@ from nats.protocol.parser import PERMISSIONS_ERR
 from holdfast.events import log_lines
 from holdfast.net.secure_channel import SecureChannel
 from holdfast.net.tls import NO_FILES, Tls
+from holdfast.runtime.backoff import Backoff
 from holdfast.runtime.standstill import now
 
 if TYPE_CHECKING:
@@ -58,6 +59,9 @@ MAX_CLUSTER_SERVERS = 64
 
 CONNECTION_LOST = "the connection was lost"
 
+FIRST_REPEAT_S, MAX_REPEAT_S = 10.0, 60.0
+"""Seconds until refused subscriptions are repeated. Each time doubles them, up to the maximum."""
+
 
 class ServerError(Error):
     """An error that the server reports and after which the connection goes on.
@@ -69,6 +73,10 @@ class ServerError(Error):
     def subject(self) -> str:
         """The subject that it names, as `as_quoted` has it; the server says it only in the text."""
         return str(self).partition('"')[2].rpartition('"')[0]
+
+    def refuses_subscription(self, subject: str) -> bool:
+        """Whether a subscription to this subject is refused, or has ended by that."""
+        return f' Subscription to "{as_quoted(subject)}"' in str(self)
 
 
 def as_quoted(subject: str) -> str:
@@ -386,6 +394,11 @@ class SafeClient(Client):
         self.msg_class = self._with_age  # type: ignore[assignment]
         self.loss_reason = CONNECTION_LOST
         """Why the connection has ended: in the words of the server, if it has said so."""
+        self._refused: set[int] = set()
+        """The subscriptions that the server has refused or ended."""
+        self._refused_again: set[int] = set()
+        """Those that it has refused since they were last repeated."""
+        self._has_refused = asyncio.Event()
 
     @property
     def has_stopped_reconnecting(self) -> bool:
@@ -435,8 +448,42 @@ class SafeClient(Client):
             self.loss_reason = f"the server ended the connection: {text}"
             await super()._process_err(err_msg)
             return
-        self._err = ServerError(f"nats: {text}")
-        await self._error_cb(self._err)
+        error = ServerError(f"nats: {text}")
+        if not self._is_known(error):
+            self._err = error
+            await self._error_cb(error)
+
+    def _is_known(self, error: ServerError) -> bool:
+        """Whether it only repeats that subscriptions are refused. Notes which ones are."""
+        subs = self._subs.items()
+        named = {number for number, each in subs if error.refuses_subscription(each.subject)}
+        is_known = bool(named) and named <= self._refused
+        self._refused |= named
+        self._refused_again |= named
+        if named:
+            self._has_refused.set()
+        return is_known
+
+    async def repeat_refused(self) -> None:
+        """Repeats subscriptions that are refused, until it is cancelled: permissions may change."""
+        while True:
+            await self._has_refused.wait()
+            pauses = Backoff(FIRST_REPEAT_S, MAX_REPEAT_S, jitter=True)
+            while self._refused:
+                await asyncio.sleep(pauses.failed())
+                if self.is_connected:
+                    with contextlib.suppress(Error, OSError):
+                        await self._repeat()
+            self._has_refused.clear()
+
+    async def _repeat(self) -> None:
+        """Repeats them once. What is refused again is so before the answer to the flush."""
+        self._refused_again = set()
+        for number in tuple(self._refused):
+            if (subscription := self._subs.get(number)) is not None:
+                await self._send_subscribe(subscription)
+        await self.flush()
+        self._refused = self._refused_again
 
     async def _process_pong(self) -> None:
         """Passes over the answer to a flush that was given up: nats-py would end its reading."""
