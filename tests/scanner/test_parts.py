@@ -17,6 +17,7 @@ from holdfast.net.nats import batch
 from holdfast.net.nats import outbox as outboxes
 from holdfast.net.nats.connection import (
     FIRST_PAUSE_S,
+    MAX_LOGGED,
     MAX_PAUSE_S,
     PROVEN_S,
     NatsConnection,
@@ -437,6 +438,18 @@ def test_an_error_of_the_server_is_logged_once_and_as_it_is_spelled(
     assert [each["reason"] for each in logged(caplog, "nats_error")] == [
         f"nats: {each}" for each in reasons[1:3]
     ]
+
+
+def test_reasons_that_alternate_are_logged_once_each(caplog: pytest.LogCaptureFixture) -> None:
+    client = SafeClient()
+    client.options = {}
+    broker = NatsConnection(Servers(), {}, lambda _: None, Ping(), name="test")
+    for reason in ("Connection lost", "Broken pipe") * 5:
+        broker._note(client, OSError(reason))
+    assert [each["attempts"] for each in logged(caplog, "nats_connect_failed")] == [1, 2]
+    for number in range(2 * MAX_LOGGED):
+        broker._note(client, OSError(str(number)))
+    assert len(broker._logged) == MAX_LOGGED
 
 
 def test_a_server_that_ends_each_connection_is_asked_less_and_less_often() -> None:

@@ -184,6 +184,20 @@ def test_a_server_that_ends_the_connection_at_once_is_quoted(
     assert lost["reason"] == "the server ended the connection: too many friends"
 
 
+def test_a_server_without_room_is_quoted(
+    run_scanner: Run, serve_nats: Serve, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = tmp_path / "nats.conf"
+    config.write_text("max_connections: 1")
+    server = serve_nats("-c", str(config))
+    with Caller(server.url):
+        broker = broker_of(run_scanner(server, wait=False).scanner)
+        wire.until(lambda: broker._failed_attempts > 5, "it is tried again")
+    found = reasons(caplog, "nats_connect_failed")
+    assert "nats: maximum connections exceeded" in found
+    assert len(found) == len(set(found)), "each reason is logged once"
+
+
 def test_a_token_opens_the_door(run_scanner: Run, serve_nats: Serve, tmp_path: Path) -> None:
     server = serve_nats("--auth", "s3cret")
     token = tmp_path / "token"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import math
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Collection, Iterable, Mapping
 from contextlib import asynccontextmanager
@@ -46,6 +47,9 @@ PROVEN_S = 2.5
 
 LOG_INTERVAL_S = 600.0
 """Seconds before an error, or a failure to connect, with the same reason is logged again."""
+
+MAX_LOGGED = 100
+"""Limit of remembered reasons. A server that refuses clients may have several in turn."""
 
 MAX_PENDING_BYTES = 64 * 1024 * 1024
 """The limit of nats-py's send buffer in bytes. The outbox always stays below it."""
@@ -139,7 +143,8 @@ class NatsConnection:
         self._failed_attempts = 0
         """Attempts to connect that have failed since there was a connection."""
         self._connected_at = 0.0
-        self._logged_failure = ("", 0.0)
+        self._logged: dict[str, float] = {}
+        """When each reason was logged."""
         self._worked = False
         self.client: SafeClient | None = None
         """The client while there is a connection."""
@@ -258,7 +263,8 @@ class NatsConnection:
             server="" if url is None else f"{url.hostname}:{url.port}",
             attempts=self._failed_attempts + 1,
         )
-        self._logged_failure, self._worked = ("", 0.0), True
+        self._logged.clear()
+        self._worked = True
         self._failed_attempts, self._connected_at = 0, time.monotonic()
         self.client = client
         self.connected(client)
@@ -281,9 +287,11 @@ class NatsConnection:
         if not is_connected:
             self._failed_attempts += 1
             self._pause(client, 0.0)
-        if reason == self._logged_failure[0] and now - self._logged_failure[1] < LOG_INTERVAL_S:
+        if now - self._logged.get(reason, -math.inf) < LOG_INTERVAL_S:
             return
-        self._logged_failure = (reason, now)
+        self._logged[reason] = now
+        if len(self._logged) > MAX_LOGGED:
+            del self._logged[min(self._logged, key=self._logged.__getitem__)]
         if is_connected:
             log_lines.refused("nats_error", kind="nats", reason=reason)
             return

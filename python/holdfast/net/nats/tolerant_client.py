@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 END = b"\r\n"
 CHUNK_BYTES = 65_536
 PING, PONG = b"PING\r\n", b"PONG\r\n"
+LOGIN = b"CONNECT "
 CLOSE_TIMEOUT_S = 1.0
 """Seconds to send the last bytes of a connection that is closed."""
 
@@ -120,6 +121,8 @@ class MessageTransport(TcpTransport):
         self._channel: SecureChannel | None = None
         self._early = b""
         """What was decrypted and is not read yet."""
+        self._login = b""
+        """The line of the client that begins a connection, until it is sent."""
         self.errors: deque[str] = deque()
         """The errors of the server that nats-py has not parsed yet: its parser changes the case."""
         self._pings: deque[tuple[float, bool]] = deque()
@@ -151,7 +154,7 @@ class MessageTransport(TcpTransport):
         self.close()
         self._buffer.clear()
         self._head = None
-        self._early = b""
+        self._early = self._login = b""
         self.errors.clear()
         self._pings.clear()
         await super().connect(uri, buffer_size, connect_timeout)
@@ -206,9 +209,17 @@ class MessageTransport(TcpTransport):
             super().write(channel.outgoing())  # type: ignore[no-untyped-call]
 
     def write(self, payload: bytes) -> None:
-        """Sends bytes, and notes when a ping is sent."""
+        """Sends bytes, and notes when a ping is sent.
+
+        The login is sent with the ping that follows it: if the server has ended the connection, a
+        second write would fail, and what it has said before would be lost.
+        """
+        if payload.startswith(LOGIN):
+            self._login = payload
+            return
         if payload == PING:
             self._note_ping(hidden=False)
+        payload, self._login = self._login + payload, b""
         self._send(payload)
 
     def writelines(self, payload: list[bytes]) -> None:
@@ -223,8 +234,10 @@ class MessageTransport(TcpTransport):
         super().write(data)  # type: ignore[no-untyped-call]
 
     async def readline(self) -> bytes:
-        """Returns one of the lines that begin a connection."""
+        """Returns one of the lines that begin a connection. Raises the error of a server."""
         line = await self._line()
+        if line.startswith(b"-ERR"):
+            raise Error(f"nats: {_error_text(line.removeprefix(b'-ERR'))}")
         if line.startswith(PONG):
             self._note_pong()
         elif line.startswith(b"INFO"):
@@ -232,7 +245,7 @@ class MessageTransport(TcpTransport):
             if self._requires_tls and not info.get("tls_required"):
                 raise Error("the server does not use TLS")
             return _info_line(info)
-        elif not line.startswith((b"+OK", b"-ERR")):
+        elif not line.startswith(b"+OK"):
             raise ProtocolError("nats: unknown protocol")
         return line
 
