@@ -8,6 +8,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from nats.aio.client import Client, ServerVersion
 from nats.errors import TimeoutError as NatsTimeout
 
 from holdfast.net.nats import tolerant_client
@@ -23,8 +24,6 @@ from support.leases import ENDLESS, LASTING, SHORT, make_settled
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterator
     from pathlib import Path
-
-    from nats.aio.client import Client
 
 BUCKET = "leases"
 
@@ -293,6 +292,24 @@ def test_a_node_whose_inboxes_were_forbidden_takes_its_lease_again(
         asyncio.run(work())
     finally:
         server.kill()
+
+
+def test_an_old_server_is_named(server: NatsServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    old = property(lambda _: ServerVersion("2.10.29"))
+    monkeypatch.setattr(tolerant_client.SafeClient, "connected_server_version", old)
+
+    async def work() -> None:
+        # An old server ignores that keys should have TTLs.
+        client = Client()
+        await client.connect(server.url)
+        name = f"KV_{BUCKET}"
+        await client.jetstream().add_stream(name=name, subjects=[f"$KV.{BUCKET}.>"])
+        await client.close()
+        async with running(server.url, "a", SHORT) as node:
+            await until(lambda: "2.11 or newer" in str(node.leases.reason), "it says so")
+            assert str(node.leases.reason).endswith("and this is 2.10.29")
+
+    asyncio.run(work())
 
 
 def test_a_bucket_of_another_kind_is_named(server: NatsServer) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -73,6 +74,9 @@ REQUEST_TIMEOUT_S = 0.9
 OPEN_TIMEOUT_S = 5.0
 """The same while the bucket is made."""
 
+MIN_SERVER = (2, 11)
+"""The first version of nats-server that has TTLs of keys. Older ones make a bucket without them."""
+
 MARKER_TTL_S = 60.0
 """Seconds that the server keeps the mark of a key that has ended."""
 
@@ -113,6 +117,12 @@ class LeaseBucket(KeyBucket):
 
     async def _flaw(self) -> str:
         """Why this is no bucket of leases. Raises the errors of nats-py."""
+        server = self.client.connected_server_version
+        with contextlib.suppress(TypeError, ValueError):  # As the server says it.
+            if (server.major, server.minor) < MIN_SERVER:
+                required = ".".join(map(str, MIN_SERVER))
+                own = f"{server.major}.{server.minor}.{server.patch}"
+                return f"leases require nats-server {required} or newer, and this is {own}"
         flaw = f"the bucket {self.name} exists without TTLs of keys or with a history"
         jetstream = self.client.jetstream(timeout=REQUEST_TIMEOUT_S)
         found = await jetstream.stream_info(self._stream, subjects_filter=">")
