@@ -9,9 +9,11 @@ from __future__ import annotations
 import asyncio
 import itertools
 import os
+import shutil
 import signal
 import socket
 import struct
+import subprocess
 import sys
 import threading
 import time
@@ -598,6 +600,63 @@ def test_a_connection_that_begins_with_noise_is_ended(make: Make, dial: Dial) ->
             client.read_holding_registers(7, 2)
     assert client.read_holding_registers(8, 2) == [8, 9]
     assert connections(device) == 6
+
+
+ALONE = """
+import asyncio, fcntl, socket, struct, sys
+import holdfast
+from holdfast import _core
+from holdfast.client import endpoint, url
+with socket.socket() as each:
+    fcntl.ioctl(each, 0x8914, struct.pack("16sH22x", b"lo", 1))  # Up.
+with open("/proc/sys/net/ipv4/ip_local_port_range", "w") as ports:
+    ports.write("40000 40000")
+print("alone", flush=True)
+
+async def write(at):
+    async with holdfast.Client(at, timeout=60) as plc:
+        await plc.write_register(0, 1)
+
+def write_sync(at):
+    with holdfast.SyncClient(at, timeout=60) as plc:
+        plc.write_register(0, 1)
+
+def write_by_link(at):
+    poller, caller = _core.Poller([]), _core.Caller()
+    with socket.socket(fileno=caller.detach()) as ended:
+        link = poller.link(endpoint.endpoint(url.parse(at)))
+        link.call(caller, _core.Request.write_register(0, 1), 1, 60)
+        ended.setblocking(True)
+        ended.recv(1)
+    [(_, _, result)] = caller.take()
+    poller.stop()
+    if isinstance(result, Exception):
+        raise result
+
+for at in ("tcp", "rtu+tcp", "udp"):
+    for call in (lambda at: asyncio.run(write(at)), write_sync, write_by_link):
+        try:
+            call(at + "://127.0.0.1:40000")
+            print("confirmed")
+        except holdfast.ConnectFailed as error:
+            print(error.detail.lower())
+for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+    with socket.socket(type=kind) as device:
+        device.bind(("127.0.0.1", 40000))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux has network namespaces")
+def test_a_client_whose_port_the_system_takes_from_the_device_does_not_answer_itself() -> None:
+    """Nobody listens at the only port of a network that the system has for clients."""
+    command = ["unshare", "--map-root-user", "--net", sys.executable, "-c", ALONE]
+    if shutil.which(command[0]) is None:
+        pytest.skip("needs unshare")
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=wire.DEADLINE)
+    if not ran.stdout:
+        pytest.skip(f"no network namespace: {ran.stderr}")
+    assert ran.stdout.split("\n") == ["alone", *["connection refused"] * 9, ""], ran.stderr
+    assert ran.returncode == 0, ran.stderr
 
 
 @pytest.mark.parametrize("kind", STREAMS)

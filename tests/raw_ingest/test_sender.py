@@ -523,6 +523,30 @@ def test_the_next_address_of_a_host_is_tried(
     send("plant", there.port)
 
 
+def test_the_next_address_of_a_host_is_tried_after_a_connection_to_itself(
+    send: Send, receiver: Receive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own: list[Any] = []
+
+    class Socket(socket.socket):
+        """Chooses the first address that it is to connect to as its own, as a system may."""
+
+        def connect(self, address: Any) -> None:
+            if not own:
+                self.bind(("127.0.0.1", 0))
+                own.append(address := self.getsockname())
+            super().connect(address)
+
+    there = receiver(answering(b"\x00"))
+    found = [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("127.0.0.1", there.port))] * 2
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "socket", Socket)
+        send("plant", there.port)
+    with socket.socket() as late:
+        late.bind(own[0])
+
+
 def test_a_dead_address_of_a_host_leaves_time_for_the_next(
     receiver: Receive, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,4 +1,4 @@
-//! Receiving and sending on the TCP sockets of the runtime, for servers and clients.
+//! Receiving and sending on the TCP sockets of the runtime, for servers and clients, and limits of sockets.
 //!
 //! In a process with several threads, the C library notes around each such call that the thread may be
 //! cancelled in it. On Linux, the system is called without that: it takes a thirtieth of a request.
@@ -73,6 +73,27 @@ pub(crate) fn send(socket: &TcpStream, output: &[u8]) -> io::Result<usize> {
     return socket.try_write(output);
 }
 
+/// Refuses a socket that is connected to itself. While nobody listens at a port of this machine, the system may
+/// choose that port for the client (a "simultaneous open" of TCP). The socket would receive its own requests, and
+/// the echo of a write is its confirmation.
+///
+/// # Errors
+/// `ConnectionRefused`, as without the coincidence. The port is free again at once.
+pub(crate) fn not_to_itself<S>(socket: S) -> io::Result<S>
+where
+    for<'s> SockRef<'s>: From<&'s S>,
+{
+    let ends = SockRef::from(&socket);
+    // A connection that has already ended has no peer.
+    let peer = ends.peer_addr().ok();
+    if peer.is_none() || peer != ends.local_addr().ok() {
+        return Ok(socket);
+    }
+    // Closed without a reset, it would keep the port from its device for a minute.
+    let _ = ends.set_linger(Some(Duration::ZERO));
+    Err(ErrorKind::ConnectionRefused.into())
+}
+
 /// How long the system repeats bytes of a connection that its peer does not acknowledge. Without a limit, it does
 /// so for minutes, also for a process that has ended: once the network is back, a device would get a write that was
 /// given up long ago. Only Linux has such a limit.
@@ -96,7 +117,25 @@ impl ResendLimit {
 
 #[cfg(all(test, target_os = "linux"))]
 mod tests {
+    use std::net::SocketAddr;
+
+    use socket2::{Domain, Socket, Type};
+
     use super::*;
+
+    #[test]
+    fn a_socket_that_is_connected_to_itself_is_refused_and_its_port_is_free_again() {
+        for kind in [Type::STREAM, Type::DGRAM] {
+            let new = || Socket::new(Domain::IPV4, kind, None).unwrap();
+            let itself = new();
+            itself.bind(&SocketAddr::from(([127, 0, 0, 1], 0)).into()).unwrap();
+            let own = itself.local_addr().unwrap();
+            itself.connect(&own).unwrap();
+            let refused = not_to_itself(itself).unwrap_err();
+            assert_eq!(refused.kind(), ErrorKind::ConnectionRefused, "{kind:?}");
+            new().bind(&own).unwrap();
+        }
+    }
 
     #[test]
     fn the_limit_is_the_longest_timeout_in_whole_seconds() {

@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
+import os
 import socket
+import struct
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -81,15 +84,31 @@ def _countdown(candidates: Sequence[SocketAddress]) -> Iterator[tuple[int, Socke
 
 @contextlib.contextmanager
 def _prepared(family: int) -> Iterator[socket.socket]:
-    """A socket, which is closed if connecting fails."""
+    """A socket, which is closed if connecting fails. Raises `OSError` if it is its own peer."""
     connection = socket.socket(family)
     try:
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         yield connection
+        if _is_to_itself(connection):
+            # Closed without a reset, it would keep the port from its device for a minute.
+            linger = struct.pack("hh" if sys.platform == "win32" else "ii", 1, 0)
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+            raise ConnectionRefusedError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
     except BaseException:
         connection.close()
         raise
+
+
+def _is_to_itself(connection: socket.socket) -> bool:
+    """Whether a connection has one socket at both ends, as in the core: its replies are an echo.
+
+    While nobody listens at a port of this machine, the system may choose it for the client.
+    """
+    try:
+        return bool(connection.getsockname() == connection.getpeername())
+    except OSError:
+        return False  # It has already ended.
 
 
 def remaining_s(deadline: float) -> float:

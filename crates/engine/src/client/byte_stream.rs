@@ -9,7 +9,7 @@ use socket2::SockRef;
 use crate::client::Peers;
 use crate::name_lookup::{self, Unresolved};
 use crate::serial_line::OpenLine;
-use crate::socket_calls::ResendLimit;
+use crate::socket_calls::{ResendLimit, not_to_itself};
 use crate::tls::TlsFailure;
 
 /// The shortest timeout that all systems accept.
@@ -133,7 +133,7 @@ impl TcpByteStream {
         let found = addresses(host, port, peers, deadline)?;
         let socket = first(found, |address, others| {
             let timeout = left(deadline)?.min(name_lookup::share(deadline, others));
-            TcpStream::connect_timeout(&address, timeout.max(MIN_TIMEOUT))
+            not_to_itself(TcpStream::connect_timeout(&address, timeout.max(MIN_TIMEOUT))?)
         })?;
         socket.set_nodelay(true)?;
         Ok(TcpByteStream {
@@ -214,7 +214,7 @@ pub(super) fn connect_udp(
         let any = if address.is_ipv6() { "[::]:0" } else { "0.0.0.0:0" };
         let socket = UdpSocket::bind(any)?;
         socket.connect(address)?;
-        Ok(socket)
+        not_to_itself(socket)
     })?)
 }
 

@@ -7,6 +7,7 @@ use tokio::net::TcpStream;
 use tokio::time::{Instant, timeout};
 
 use crate::name_lookup;
+use crate::socket_calls::not_to_itself;
 
 /// Tries the addresses in order. Each but the last gets its share of the time until the deadline. The caller
 /// limits the last one.
@@ -18,14 +19,18 @@ pub(crate) async fn dial(addresses: Vec<SocketAddr>, deadline: Instant) -> io::R
     while let Some(address) = addresses.next() {
         let others = addresses.len();
         if others == 0 {
-            return TcpStream::connect(address).await;
+            return connected(address).await;
         }
         let share = name_lookup::share(deadline.into_std(), others);
-        if let Ok(Ok(stream)) = timeout(share, TcpStream::connect(address)).await {
+        if let Ok(Ok(stream)) = timeout(share, connected(address)).await {
             return Ok(stream);
         }
     }
     Err(io::Error::new(ErrorKind::NotFound, "the name has no address"))
+}
+
+async fn connected(address: SocketAddr) -> io::Result<TcpStream> {
+    not_to_itself(TcpStream::connect(address).await?)
 }
 
 #[cfg(test)]
