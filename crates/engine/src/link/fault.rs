@@ -148,6 +148,8 @@ fn is_unreachable(why: ErrorKind) -> bool {
             | ErrorKind::NetworkUnreachable
             | ErrorKind::NetworkDown
             | ErrorKind::TimedOut
+            // This machine has no free port.
+            | ErrorKind::AddrNotAvailable
             // A name, or a serial device.
             | ErrorKind::NotFound
     )
@@ -173,6 +175,7 @@ mod tests {
             ErrorKind::NetworkUnreachable,
             ErrorKind::NetworkDown,
             ErrorKind::TimedOut,
+            ErrorKind::AddrNotAvailable,
             ErrorKind::NotFound,
         ] {
             assert_eq!(failed(kind), Fault::Unreachable, "{kind:?}");
