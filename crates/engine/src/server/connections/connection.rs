@@ -531,10 +531,12 @@ impl<F: Framing> Answering<F> {
         if destination.is_some() || self.deferred.is_some() {
             // After a standstill, a request and the end of its peer are received together. A device may be faster
             // than the next read, which finds the end.
-            let is_write = destination.is_some_and(RequestDestination::is_device)
+            if let Some(device) = destination.filter(|destination| destination.is_device())
                 && !only_reads(pdu)
-                && !(F::HAS_BROADCASTS && unit_id == 0);
-            if is_write && !is_there() {
+                && !(F::HAS_BROADCASTS && unit_id == 0)
+                && !is_there()
+                && self.unit_server.withdraw(&self.rights, device, unit_id, pdu)
+            {
                 return None;
             }
             let deferred = self.deferred.get_or_insert_default();
@@ -919,11 +921,18 @@ mod tests {
             (&[6, 0, 0, 0, 7][..], false, false),
             (&[6, 0, 0, 0, 7], true, true),
             (&[3, 0, 0, 0, 1], false, true),
+            (&[6, 0, 0], false, false),
         ] {
             let mut answering = answering_by::<Mbap>(&rule);
             let input = [frame(2, pdu), frame(1, &[6, 0, 0, 0, 9])].concat();
             answering.answer(&|| is_there, &input, &mut output);
             assert_eq!(called.try_recv().is_ok(), is_sent, "{pdu:?}");
+            let is_refused = pdu.len() < 5;
+            assert_eq!(
+                answering.is_waiting(),
+                is_sent || is_refused,
+                "refusals are reported: {pdu:?}"
+            );
             let read =
                 Read { area: Area::HoldingRegisters, address: 0, count: 1, out: &mut register };
             memory.read(Access::Client, read).unwrap();

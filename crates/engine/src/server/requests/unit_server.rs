@@ -214,6 +214,26 @@ impl UnitServer {
         })
     }
 
+    /// Drops a write to a device whose peer has ended. Returns whether it did: what is refused goes on, to be
+    /// reported.
+    pub(crate) fn withdraw(
+        &self,
+        rights: &PeerRights,
+        device: &RequestDestination,
+        unit_id: u8,
+        request: &[u8],
+    ) -> bool {
+        if check_forwarded(rights, device, unit_id, request).is_err() {
+            return false;
+        }
+        self.counters.request(request.first().copied().unwrap_or_default());
+        if let RequestDestination::Device(route) = device {
+            route.link.counters.requests.add();
+            route.link.counters.withdrawn.add();
+        }
+        true
+    }
+
     /// Counts what a device has answered, or what was answered in its place.
     pub(crate) fn forwarded(&self, request: &[u8], reply: &[u8]) {
         let exception = exception_in(reply);
