@@ -241,3 +241,24 @@ def test_an_empty_token_is_nobodys_though_a_token_has_its_hash(value: bytes) -> 
     with pytest.raises(BadRequest, match="the token is empty") as caught:
         owner(request, [("edge", hashlib.sha256(b"").digest())])
     assert caught.value.reason == "unauthorized"
+
+
+def test_streams_that_are_asked_for_at_once_do_not_exceed_the_limit() -> None:
+    async def test() -> None:
+        # Half of the connections are two.
+        service = web.Service({"plant_a": holdfast.Memory(coils=8)}, max_connections=4)
+        app = service.made()._app
+        service.listener.close()
+        requests = [Arriving("GET", "/api/v1/memory/changes", COIL) for _ in range(4)]
+        tasks = [asyncio.ensure_future(waited(app(each))) for each in requests]
+        await asyncio.gather(*(each.got.wait() for each in requests[:2]))
+        assert app.open_streams == 2
+        answers = [await each for each in tasks[2:]]
+        assert [answer and answer.status for answer in answers] == [503, 503]
+        assert [each.sent for each in requests[2:]] == [[], []]
+        for each in requests[:2]:
+            each.leave()
+        await asyncio.gather(*tasks)
+        assert app.open_streams == 0
+
+    run(test)

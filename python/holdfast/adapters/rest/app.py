@@ -166,16 +166,17 @@ class App(Application):
         values = self._memory_access.read(**given, grant=grant, peer=request.peer)
         return json_response({"values": values})
 
-    def changes(self, request: Request, given: Given) -> Response | Later:
+    async def changes(self, request: Request, given: Given) -> Response | None:
         """Follows ranges."""
         memory, ranges = given["memory"], _ranges(given)
-        self._streams.check_room()
-        grant = self.grants.of(request.who)
-        follower = self._memory_access.follow(memory, ranges, grant, request.peer)
-        if request.method == "HEAD":
-            return Response(200, headers=list(events.HEADERS))
-        places = [(memory, area) for area, _, _ in ranges]
-        return self._streams.serve(request, follower, places, given["min_interval"])
+        with self._streams.place():
+            grant = self.grants.of(request.who)
+            follower = self._memory_access.follow(memory, ranges, grant, request.peer)
+            if request.method == "HEAD":
+                return Response(200, headers=list(events.HEADERS))
+            places = [(memory, area) for area, _, _ in ranges]
+            await self._streams.serve(request, follower, places, given["min_interval"])
+        return None
 
     def health(self, _: Request, __: Given) -> Response:
         """Tells that the server is running."""

@@ -9,6 +9,7 @@ stream says so and waits. Which part of a range an event has: crates/memory/src/
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from typing import TYPE_CHECKING
 
 from holdfast.ingest import unreadable
@@ -16,7 +17,7 @@ from holdfast.net.http.events import Stream
 from holdfast.net.http.requests import BadRequest
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from holdfast.ingest import Follower
     from holdfast.net.http.requests import Request
@@ -54,11 +55,17 @@ class ChangeStreams:
         """Ends all streams. Called in the thread of the server."""
         self._ending.set()
 
-    def check_room(self) -> None:
-        """Raises `BadRequest` if no more streams may be opened."""
+    @contextlib.contextmanager
+    def place(self) -> Iterator[None]:
+        """Counts a stream. Raises `BadRequest` above the limit."""
         if self.open >= self.most:
             detail = f"too many change streams: {self.most} are open, which is the limit"
             raise BadRequest("busy", detail)
+        self.open += 1
+        try:
+            yield
+        finally:
+            self.open -= 1
 
     async def serve(
         self,
@@ -67,11 +74,10 @@ class ChangeStreams:
         ranges: Sequence[tuple[str, str]],
         min_interval: float,
     ) -> None:
-        """Sends events until the peer leaves or the server stops.
+        """Sends events until the peer leaves or the server stops. Called in a `place`.
 
         `ranges` are the memory and the area of each range of the follower.
         """
-        self.open += 1
         gone = asyncio.Event()
         request.when_gone(gone.set)
         ends = [asyncio.create_task(event.wait()) for event in (gone, self._ending)]
@@ -81,7 +87,6 @@ class ChangeStreams:
             await _follow(stream, follower, ranges, min_interval, ends)
             await stream.end()
         finally:
-            self.open -= 1
             for each in ends:
                 each.cancel()
             await asyncio.gather(*ends, return_exceptions=True)
