@@ -123,6 +123,32 @@ def test_a_name_is_looked_up_once_for_all_who_ask_meanwhile(slow: Slow) -> None:
     assert slow.asked == ["dead", "other", "dead"]
 
 
+def test_addresses_that_came_too_late_are_for_the_next_attempt(
+    slow: Slow, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    resolve = Resolver()
+
+    def come_too_late() -> None:
+        slow.answers.clear()
+        before = len(slow.asked)
+        lookup = resolve.look_up("plc", 502)
+        wire.until(lambda: len(slow.asked) > before, "it is looked up")
+        lookup.cancel()
+        slow.answers.set()
+        wire.until(lambda: not resolve._threads, "the lookup has ended")
+
+    come_too_late()
+    address = (socket.AF_INET, ("10.0.0.1", 502))
+    assert resolve.wait_for("plc", 502, 0) == [address]
+    assert slow.asked == ["plc"]
+    assert resolve.wait_for("plc", 502, wire.DEADLINE) == [address]
+    assert slow.asked == ["plc"] * 2
+    come_too_late()
+    monkeypatch.setattr("holdfast.net.resolver.KEPT_S", 0.0)
+    assert resolve.wait_for("plc", 502, wire.DEADLINE) == [address]
+    assert slow.asked == ["plc"] * 4
+
+
 def test_a_failure_is_an_exception_of_its_own_for_each(monkeypatch: pytest.MonkeyPatch) -> None:
     held = threading.Event()
 

@@ -1,7 +1,9 @@
 //! Looks up the addresses of names.
 //!
 //! A call to the system's resolver can't be ended early. It runs in a thread, which callers leave behind when
-//! their time is over. Who asks for a name that is being looked up waits for the same thread.
+//! their time is over. Who asks for a name that is being looked up waits for the same thread. Addresses that
+//! came when nobody waited any more are for the next attempts of those who have left: a lookup may take longer than
+//! each attempt.
 
 use std::collections::{HashMap, VecDeque};
 use std::io;
@@ -26,10 +28,14 @@ pub(crate) enum Unresolved {
 /// The addresses have port 0.
 type Found = Result<Vec<SocketAddr>, Arc<io::Error>>;
 
-type Waiting = Box<dyn FnOnce(Found) + Send>;
+/// Returns whether the result is taken: the caller may have left.
+type Waiting = Box<dyn FnOnce(Found) -> bool + Send>;
 
 /// Threads at most; the lookups of further names wait.
 const MAX_THREADS: usize = 512;
+
+/// How long addresses are kept that came too late: as long as the longest usual pause between two attempts.
+const KEPT: Duration = Duration::from_secs(60);
 
 static LOOKUPS: LazyLock<Mutex<Lookups>> = LazyLock::new(Mutex::default);
 
@@ -42,6 +48,25 @@ struct Lookups {
     waiting: HashMap<String, Vec<Waiting>>,
     /// What no thread has begun.
     queue: VecDeque<Box<dyn FnOnce() + Send>>,
+    /// What came when all who had asked had left.
+    late: HashMap<String, Late>,
+}
+
+struct Late {
+    came: Instant,
+    addresses: Vec<SocketAddr>,
+    /// How many may still have them: each who had asked once.
+    left: usize,
+}
+
+impl Lookups {
+    /// The addresses of a name that came too late, once for each who had asked.
+    fn take_late(&mut self, host: &str) -> Option<Vec<SocketAddr>> {
+        self.late.retain(|_, late| late.left > 0 && late.came.elapsed() < KEPT);
+        let late = self.late.get_mut(host)?;
+        late.left -= 1;
+        Some(late.addresses.clone())
+    }
 }
 
 /// The addresses of a name or of an address in text, in the order of the system.
@@ -67,7 +92,7 @@ fn addresses_by(
 ) -> Result<Vec<SocketAddr>, Unresolved> {
     let (sender, found) = sync_channel(1);
     // Fails if the caller's time is over.
-    look_up(host, Box::new(move |found| drop(sender.send(found))), resolve);
+    look_up(host, Box::new(move |found| sender.send(found).is_ok()), resolve);
     let left = deadline.saturating_duration_since(Instant::now());
     match found.recv_timeout(left) {
         Ok(found) => with_port(found, port).map_err(Unresolved::Failed),
@@ -85,7 +110,7 @@ pub(crate) async fn addresses_of(host: &str, port: u16) -> io::Result<Vec<Socket
         return Ok(vec![SocketAddr::new(address, port)]);
     }
     let (sender, found) = oneshot::channel();
-    look_up(host, Box::new(move |found| drop(sender.send(found))), resolve);
+    look_up(host, Box::new(move |found| sender.send(found).is_ok()), resolve);
     with_port(found.await.expect("a lookup has a result"), port)
 }
 
@@ -120,6 +145,11 @@ fn look_up(
     }
     if let Some(others) = all.waiting.get_mut(host) {
         return others.push(waiting);
+    }
+    if let Some(addresses) = all.take_late(host) {
+        drop(all);
+        waiting(Ok(addresses));
+        return;
     }
     all.waiting.insert(host.to_owned(), vec![waiting]);
     let name = host.to_owned();
@@ -164,13 +194,23 @@ fn refuse(error: &io::Error) {
     drop(all);
     let error = io::Error::other(format!("can't start a thread to look up the name: {error}"));
     let error = Arc::new(error);
-    waiting.into_values().flatten().for_each(|waiting| waiting(Err(Arc::clone(&error))));
+    for waiting in waiting.into_values().flatten() {
+        waiting(Err(Arc::clone(&error)));
+    }
 }
 
-/// Hands a result to all who wait for it.
+/// Hands a result to all who wait for it. If all have left, addresses are kept for them.
 fn finish(host: &str, found: &Found) {
     let waiting = lookups().waiting.remove(host).unwrap_or_default();
-    waiting.into_iter().for_each(|waiting| waiting(found.clone()));
+    let asked = waiting.len();
+    let mut is_taken = false;
+    for waiting in waiting {
+        is_taken |= waiting(found.clone());
+    }
+    if let (false, Ok(addresses)) = (is_taken, found) {
+        let late = Late { came: Instant::now(), addresses: addresses.clone(), left: asked };
+        lookups().late.insert(host.to_owned(), late);
+    }
 }
 
 fn lookups() -> MutexGuard<'static, Lookups> {
@@ -185,7 +225,7 @@ pub(crate) fn hold(host: &str) -> std::sync::mpsc::Sender<()> {
         let _ = held.recv();
         Ok(Vec::new())
     };
-    look_up(host, Box::new(drop), resolve);
+    look_up(host, Box::new(|_| true), resolve);
     sender
 }
 
@@ -224,6 +264,32 @@ mod tests {
         assert_eq!(again.join().unwrap().unwrap(), ["192.0.2.1:802".parse().unwrap()]);
         let anew = addresses_by("slow.test", 1, later(60), |_| Ok(Vec::new()));
         assert_eq!(anew.unwrap(), []);
+    }
+
+    #[test]
+    fn addresses_that_came_too_late_are_for_the_next_attempts_of_those_who_had_asked() {
+        let late = |host: &str| {
+            let (go_on, held) = channel::<()>();
+            let slow = move |_: &str| {
+                held.recv().unwrap();
+                Ok(vec!["192.0.2.1:0".parse().unwrap()])
+            };
+            let first = addresses_by(host, 502, Instant::now(), slow);
+            assert!(matches!(first, Err(Unresolved::TooLate)));
+            go_on.send(()).unwrap();
+            while !lookups().late.contains_key(host) {
+                thread::yield_now();
+            }
+        };
+        late("late.test");
+        let next = |_: &str| unreachable!("its addresses have come");
+        let found = addresses_by("late.test", 802, later(60), next).unwrap();
+        assert_eq!(found, ["192.0.2.1:802".parse().unwrap()]);
+        assert_eq!(addresses_by("late.test", 1, later(60), |_| Ok(Vec::new())).unwrap(), []);
+
+        late("old.test");
+        lookups().late.get_mut("old.test").unwrap().came -= KEPT;
+        assert_eq!(addresses_by("old.test", 1, later(60), |_| Ok(Vec::new())).unwrap(), []);
     }
 
     #[test]

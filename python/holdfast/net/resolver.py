@@ -2,8 +2,9 @@
 
 A call to the system's resolver cannot be interrupted. So it runs in daemon threads, which neither a
 stop, nor the exit of the process, nor a caller with a timeout has to wait for. Whoever asks for a
-name that is being looked up waits for the same thread. The number of threads is limited; further
-lookups are queued until their callers give up.
+name that is being looked up waits for the same thread. Addresses that came when nobody waited any
+more are for the next attempt: a lookup may take longer than each attempt. The number of threads is
+limited; further lookups are queued until their callers give up.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import copy
 import os
 import socket
 import threading
+import time
 from collections.abc import Awaitable, Callable, Iterable
 from concurrent.futures import Future
 from functools import partial
@@ -35,6 +37,9 @@ MAX_LOOKUPS = 32
 
 LOOKUP_TIMEOUT_S = 5.0
 """Seconds after which a lookup fails."""
+
+KEPT_S = 60.0
+"""Seconds that addresses are kept that came too late: as in the core."""
 
 
 class NoSuchName(Exception):
@@ -67,6 +72,8 @@ class Resolver:
         """Who waits for a place, oldest first."""
         self._queue: dict[Place, None] = {}
         """The places that no thread looks up yet."""
+        self._late: dict[Place, tuple[float, list[SocketAddress]]] = {}
+        """What came when nobody waited any more, and when."""
 
     async def __call__(self, host: str) -> list[str]:
         """Returns the addresses of a name without duplicates. Raises `NoSuchName`."""
@@ -104,11 +111,16 @@ class Resolver:
                 self._process, self._threads = os.getpid(), 0
                 self._waiting.clear()
                 self._queue.clear()
-            if place not in self._waiting:
-                self._queue[place] = None
-            self._waiting.setdefault(place, []).append(lookup)
+                self._late.clear()
+            late = self._take_late(place)
+            if late is None:
+                if place not in self._waiting:
+                    self._queue[place] = None
+                self._waiting.setdefault(place, []).append(lookup)
             begins = place in self._queue and self._threads < self._most
             self._threads += begins
+        if late is not None:
+            _end([lookup], late)
         if begins:
             self._begin()
         return lookup
@@ -120,6 +132,13 @@ class Resolver:
                 waiting.remove(lookup)
             if not waiting and place in self._queue:
                 del self._queue[place], self._waiting[place]
+
+    def _take_late(self, place: Place) -> list[SocketAddress] | None:
+        """The addresses that came too late, once. Called with the lock."""
+        oldest = time.monotonic() - KEPT_S
+        self._late = {of: late for of, late in self._late.items() if late[0] > oldest}
+        _, found = self._late.pop(place, (0.0, None))
+        return found
 
     def _begin(self) -> None:
         try:
@@ -145,6 +164,8 @@ class Resolver:
             outcome = _outcome(*place)
             with self._lock:
                 lookups = self._waiting.pop(place)
+                if not (lookups or isinstance(outcome, OSError)):
+                    self._late[place] = time.monotonic(), outcome
             _end(lookups, outcome)
 
 
