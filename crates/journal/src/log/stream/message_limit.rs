@@ -20,12 +20,20 @@ struct Known {
     lowered: Option<usize>,
     /// The largest message of this connection.
     largest_sent: usize,
+    /// The size of the last message that was too large, and `lowered` before it.
+    too_large: Option<(usize, Option<usize>)>,
 }
 
 impl MessageLimit {
     /// A server was connected, which names this limit.
     pub(in crate::log) fn connected(&self, of_server: usize) {
         let mut known = lock(&self.0);
+        // The server's own limit was lowered while it ran, and it says so now.
+        if let Some((bytes, lowered)) = known.too_large.take()
+            && of_server < bytes
+        {
+            known.lowered = lowered;
+        }
         (known.of_server, known.largest_sent) = (of_server, 0);
     }
 
@@ -47,6 +55,7 @@ impl MessageLimit {
         let Some(below) = known.largest_sent.min(known.bytes()).checked_sub(1) else {
             return "raise the limit of the account or the user".to_owned();
         };
+        known.too_large = Some((below + 1, known.lowered));
         let lowered = below.checked_ilog2().map_or(0, |exponent| 1 << exponent);
         if lowered < MIN_BYTES {
             known.lowered = Some(MIN_BYTES);
@@ -97,10 +106,23 @@ mod tests {
         limit.connected(1 << 20);
         limit.sent(9000);
         assert!(limit.exceeded().ends_with("at most 8192 bytes in a message"));
+        limit.connected(1 << 20);
         limit.connected(4096);
         assert_eq!(limit.bytes(), 4096);
         limit.connected(1 << 20);
         assert_eq!(limit.bytes(), 8192);
+    }
+
+    #[test]
+    fn a_limit_that_the_server_names_is_not_learnt() {
+        let limit = MessageLimit::default();
+        limit.connected(1 << 20);
+        limit.sent(60_000);
+        limit.exceeded();
+        limit.connected(50_000);
+        assert_eq!(limit.bytes(), 50_000);
+        limit.connected(1 << 20);
+        assert_eq!(limit.bytes(), 1 << 20);
     }
 
     #[test]

@@ -54,7 +54,7 @@ pub(in crate::log) const SNAPSHOT_KEY: &str = "snapshot";
 pub(in crate::log) const DIGEST_KEY_PREFIX: &str = "digest.";
 
 /// Older releases drop the metadata of streams, and so what tells a log from another stream.
-const MIN_SERVER: (i64, i64) = (2, 10);
+const MIN_SERVER: (u32, u32) = (2, 10);
 
 const META_VERSION: &str = "holdfast-version";
 const META_LAYOUT: &str = "holdfast-layout";
@@ -520,12 +520,15 @@ fn is_taken(kind: &CreateStreamErrorKind) -> bool {
         if error.error_code() == ErrorCode::STREAM_NAME_EXIST)
 }
 
+/// Refuses a server that is known to be too old. A version of another form is not judged.
 fn check_server(client: &Client) -> Result<(), LogError> {
-    let (major, minor) = MIN_SERVER;
-    if client.is_server_compatible(major, minor, 0) {
+    let found = client.server_info().version;
+    let mut parts = found.split('.').map(str::parse::<u32>);
+    let (Some(Ok(major)), Some(Ok(minor))) = (parts.next(), parts.next()) else { return Ok(()) };
+    if (major, minor) >= MIN_SERVER {
         return Ok(());
     }
-    let found = client.server_info().version;
+    let (major, minor) = MIN_SERVER;
     let text =
         format!("the server is nats-server {found}: a log requires {major}.{minor} or newer");
     Err(LogError::Settings(text))
