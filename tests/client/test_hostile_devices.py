@@ -40,6 +40,7 @@ from support.fake_device import (
     Asked,
     Connection,
     ScriptedDevice,
+    Sender,
     Serial,
     Stream,
     Udp,
@@ -1174,6 +1175,23 @@ def test_a_read_is_sent_at_most_three_times(make: Make, dial: Dial) -> None:
         return len(device.requests) == 4
 
     wire.until_long_enough(is_sent_three_times, "it is sent three times")
+
+
+def test_a_device_that_has_gone_silent_is_asked_from_another_socket(make: Make, dial: Dial) -> None:
+    device = make("udp", good, then=silent)
+    client = connected(dial, device.url, SHORT)
+    for _ in range(3):
+        with pytest.raises(holdfast.RequestTimeout):
+            client.read_holding_registers(7, 1)
+    device.then = good
+    client.timeout = wire.DEADLINE
+
+    assert client.read_holding_registers(8, 1) == [8]
+
+    first, last = device.requests[0].peer, device.requests[-1].peer
+    assert isinstance(first, Sender)
+    assert isinstance(last, Sender)
+    assert first.address != last.address
 
 
 def test_datagrams_that_are_late_or_come_twice_are_counted(make: Make, dial: Dial) -> None:

@@ -582,6 +582,22 @@ fn a_read_is_sent_three_times_as_a_datagram_and_a_write_once() {
 }
 
 #[test]
+fn a_connection_of_datagrams_ends_after_three_timeouts_without_one() {
+    let mut client = Client::new(Transport::Udp);
+    for id in 0..5 {
+        assert_eq!(client.connection.closed(), None);
+        let ticket = client.send(WRITE);
+        client.after(SECOND);
+        assert_eq!(client.got(), [(ticket, Err(Failure::Timeout))]);
+        if id == 1 {
+            client.receive(&mbap_frame(id, 7, &[6, 0, 3, 0, 7]));
+            assert_eq!(client.connection.late(), 1);
+        }
+    }
+    assert_eq!(client.connection.closed(), Some(Closed::Silent));
+}
+
+#[test]
 fn a_datagram_that_answers_no_request_is_counted_and_a_malformed_one_ends_the_connection() {
     let mut client = Client::new(Transport::Udp);
     let ticket = client.send(read());

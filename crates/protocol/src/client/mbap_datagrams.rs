@@ -3,6 +3,7 @@
 use alloc::collections::VecDeque;
 use core::time::Duration;
 
+use super::consecutive_timeouts::ConsecutiveTimeouts;
 use super::flights::{Call, Done, Flights, Ticket};
 use super::mbap_stream;
 use super::raised_timeouts::{Lateness, MAX_RAISED_FACTOR};
@@ -28,6 +29,7 @@ pub(super) struct Datagrams {
     pub(super) lateness: Lateness,
     /// Datagrams that matched no request, since the last reply.
     strays: u32,
+    timeouts: ConsecutiveTimeouts,
     /// When to send the request again, and how many times.
     repeat: Option<Repeat>,
 }
@@ -129,6 +131,7 @@ impl Datagrams {
         now: Time,
         sink: &mut impl FnMut(Done<'_>),
     ) {
+        self.timeouts.clear();
         let Tolerance { pad, accept_unit, .. } = flights.tolerance;
         let invalid = match mbap_stream::next(datagram, pad).0 {
             Next::Frame { transaction_id, unit_id, pdu, len } if pad || len == datagram.len() => {
@@ -174,7 +177,12 @@ impl Datagrams {
             if let Some(last) = self.recent.front_mut().filter(|_| flight.may_be_unread(now)) {
                 last.sent = None;
             }
-            return flights.end(flight, Err(Failure::Timeout), sink);
+            self.timeouts.add(flight.sent, now);
+            flights.end(flight, Err(Failure::Timeout), sink);
+            if self.timeouts.are_too_many(flights.longest_timeout(), now) {
+                flights.close(Closed::Silent, sink);
+            }
+            return;
         }
         if let Some(Repeat { at, every, left }) = self.repeat
             && at <= now
