@@ -39,6 +39,10 @@ pub(crate) const KEEPALIVE: Duration = Duration::from_secs(60);
 /// How many probes without an answer end a connection. Together they take as long as the idle time.
 const KEEPALIVE_PROBES: u32 = 4;
 
+/// About how long Linux itself repeats what a peer does not acknowledge.
+#[cfg(target_os = "linux")]
+const MAX_RESEND_LIMIT: Duration = Duration::from_secs(15 * 60);
+
 /// The pause after a failed accept, usually for lack of file descriptors.
 pub(crate) const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
 
@@ -395,21 +399,51 @@ fn bind(socket: &Socket, address: SocketAddr) -> io::Result<()> {
     socket.set_nonblocking(true)
 }
 
-/// Disables delays of replies, and detects lost peers by probes after a silence of this time. The options are not
-/// essential: errors are ignored.
+/// Disables delays of replies, and detects lost peers by probes after a silence of this time. On Linux, a reply that
+/// is not acknowledged, or for which the peer has no room, ends the connection after the same time. The options are
+/// not essential: errors are ignored.
 pub(crate) fn set_tcp_options(stream: &TcpStream, keepalive_after: Duration) {
+    let socket = SockRef::from(stream);
     // Systems count whole seconds.
-    let interval = (keepalive_after / KEEPALIVE_PROBES).max(Duration::from_secs(1));
+    let interval = Duration::from_secs((keepalive_after / KEEPALIVE_PROBES).as_secs().max(1));
     let keepalive = TcpKeepalive::new().with_time(keepalive_after).with_interval(interval);
     // Windows always sends ten probes.
     #[cfg(not(target_os = "windows"))]
     let keepalive = keepalive.with_retries(KEEPALIVE_PROBES);
     let _ = stream.set_nodelay(true);
-    let _ = SockRef::from(stream).set_tcp_keepalive(&keepalive);
+    let _ = socket.set_tcp_keepalive(&keepalive);
+    #[cfg(target_os = "linux")]
+    {
+        // The limit also ends the probes. A longer one than the system's own would delay the end.
+        let limit = keepalive_after + interval * KEEPALIVE_PROBES;
+        if limit < MAX_RESEND_LIMIT {
+            let _ = socket.set_tcp_user_timeout(Some(limit));
+        }
+    }
 }
 
 /// Whether an error of `accept` concerns one peer, not the listener.
 pub(crate) fn is_of_one_peer(error: &io::Error) -> bool {
     use io::ErrorKind::{ConnectionAborted, ConnectionReset, Interrupted, WouldBlock};
     matches!(error.kind(), ConnectionAborted | ConnectionReset | Interrupted | WouldBlock)
+}
+
+#[cfg(all(test, target_os = "linux"))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unacknowledged_replies_end_a_connection_as_unanswered_probes_do() {
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let io = tokio::runtime::Builder::new_current_thread().enable_io().build().unwrap();
+        for (keepalive, limit) in [(1, Some(5)), (10, Some(18)), (60, Some(120)), (460, None)] {
+            let connecting = TcpStream::connect(listener.local_addr().unwrap());
+            let stream = io.block_on(connecting).unwrap();
+            set_tcp_options(&stream, Duration::from_secs(keepalive));
+            let set = SockRef::from(&stream).tcp_user_timeout().unwrap();
+            // An option that is not set is 0.
+            let set = set.filter(|set| !set.is_zero());
+            assert_eq!(set, limit.map(Duration::from_secs), "{keepalive} s");
+        }
+    }
 }
