@@ -31,7 +31,6 @@ use crate::server::reports::refused_request::Reported;
 use crate::server::requests::unit_server::{ASCII_DELIMITER, UnitServer, changed_delimiter};
 use crate::server::rights::functions::only_reads;
 use crate::server::rights::peer_rights::PeerRights;
-use crate::server::rights::rule::RequestDestination;
 use crate::server::transports::framing::{Ascii, Framing, Mbap, Next, Rtu};
 use crate::server::transports::stream::{self, Stream};
 
@@ -708,7 +707,7 @@ mod tests {
     use crate::server::requests::identity::Identity;
     use crate::server::requests::unit_server::UnitSettings;
     use crate::server::rights::functions::{AccessMode, Functions};
-    use crate::server::rights::rule::Rule;
+    use crate::server::rights::rule::{RequestDestination, Rule};
     use crate::server::transports::cut_tests::assert_same_outcome;
     use crate::server::transports::framing::MbapBesidePackets;
 
