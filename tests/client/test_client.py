@@ -19,6 +19,7 @@ import sys
 import threading
 import time
 import warnings
+import weakref
 from array import array
 from collections import UserList, deque
 from collections.abc import Sequence
@@ -276,8 +277,13 @@ def test_a_client_is_for_the_unit_it_is_made_for(device: Device, dial: Dial) -> 
 
 OTHER_LIBRARIES = {
     **dict.fromkeys(("unit_id", "address", "slave", "slave_id", "device_id"), "set `unit`"),
-    **dict.fromkeys(("host", "port"), "make a client with another URL"),
+    **dict.fromkeys(("slaveaddress", "slave_address", "dev_id"), "set `unit`"),
+    **dict.fromkeys(("url", "host", "port", "mode"), "make a client with another URL"),
     "handle_local_echo": "set `echo=1` in the URL",
+    "retries": "set `retries` in the URL",
+    **dict.fromkeys(("auto_close", "close_port_after_each_call"), "set `close_after=1` in the URL"),
+    **dict.fromkeys(("byteorder", "wordorder"), "an argument of `read` and `write`"),
+    **dict.fromkeys(("trace", "max_in_flight"), "an argument of the constructor"),
 }
 
 
@@ -285,20 +291,55 @@ OTHER_LIBRARIES = {
 def test_an_attribute_of_another_library_chooses_no_device(
     kind: type[holdfast.SyncClient | holdfast.Client],
 ) -> None:
-    client = kind("tcp://localhost")
-    for name, instead in OTHER_LIBRARIES.items():
-        with pytest.raises(AttributeError, match=instead):
-            setattr(client, name, 2)
-        assert not hasattr(client, name)
+    class Drive(kind):  # type: ignore[misc, valid-type]
+        pass
+
+    for client in (kind("tcp://localhost"), Drive("tcp://localhost")):
+        for name, instead in OTHER_LIBRARIES.items():
+            with pytest.raises(AttributeError, match=instead):
+                setattr(client, name, 2)
+            assert not hasattr(client, name)
+        with pytest.raises(AttributeError):
+            client.target = "tcp://other"  # type: ignore[misc]
 
 
-def test_a_subclass_may_define_an_attribute_of_another_library() -> None:
+def test_an_attribute_that_a_class_does_not_have_is_not_set() -> None:
+    client, for_asyncio = holdfast.SyncClient("tcp://localhost"), holdfast.Client("tcp://localhost")
+    server = holdfast.Server({}, bind="127.0.0.1:0", access="read-write")
+    with holdfast.Poller() as poller:
+        for made in (client, for_asyncio, server, poller):
+            with pytest.raises(AttributeError, match="interval"):
+                made.interval = 5  # type: ignore[union-attr]
+            assert weakref.ref(made)() is made
+
+
+def test_rights_of_a_server_are_not_changed_by_an_attribute() -> None:
+    class Device(holdfast.Server):
+        pass
+
+    for kind in (holdfast.Server, Device):
+        server = kind({1: holdfast.Memory(coils=1)}, bind="127.0.0.1:0", access="read-write")
+        for name in ("units", "access", "sources", "functions", "deny", "rules", "tls", "workers"):
+            with pytest.raises(AttributeError, match="an argument of the constructor"):
+                setattr(server, name, "read-only")
+        for name in ("host", "port"):
+            with pytest.raises(AttributeError, match="set `bind`"):
+                setattr(server, name, "0.0.0.0")
+
+
+def test_a_subclass_may_define_attributes_of_its_own() -> None:
     class Drive(holdfast.SyncClient):
         address = 0
 
     drive = Drive("tcp://localhost")
-    drive.address = 7
+    drive.address, drive.speed = 7, 1500  # type: ignore[attr-defined]
     assert (drive.address, Drive.address) == (7, 0)
+
+
+def test_a_client_shows_its_device() -> None:
+    assert repr(holdfast.SyncClient("tcp://plc?pause=1")) == "SyncClient('tcp://plc:502', unit=1)"
+    line = holdfast.Client("rtu:///dev/ttyUSB0", unit=7)
+    assert repr(line) == "Client('rtu:///dev/ttyUSB0', unit=7)"
 
 
 def test_a_closed_client_connects_anew(client: Face) -> None:

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 class AsyncOperations(BaseClient):
     """The operations of a client; a subclass sets the transport."""
 
+    __slots__ = ("_transport",)
+
     _transport: AsyncTransport
 
     async def read_coils(self, address: int, count: int, *, unit: int | None = None) -> list[bool]:

@@ -29,8 +29,9 @@ BROADCAST = "unit 0 of a serial line is the broadcast"
 
 
 class ForeignAttribute:
-    """An attribute with which other libraries choose the device, or make writes to it safe. If a
-    client took it as its own, it would have no effect. A subclass may define it.
+    """A name that other libraries have for a setting, or that is only an argument here. Clients and
+    servers have `__slots__`, so that nothing can be set that has no effect. This has a better text
+    than Python, and holds for subclasses, which have attributes of their own. One may define it.
     """
 
     def __init__(self, instead: str) -> None:
@@ -46,15 +47,30 @@ class ForeignAttribute:
 class BaseClient:
     """The settings of a client, checked."""
 
+    __slots__ = ("__weakref__", "_target", "_timeout", "_unit")
+
     if not TYPE_CHECKING:  # Type checkers refuse these names as all that do not exist.
         unit_id = address = slave = slave_id = device_id = ForeignAttribute("set `unit`")
-        host = port = ForeignAttribute("make a client with another URL")
+        slaveaddress = slave_address = dev_id = unit_id
+        url = host = port = mode = ForeignAttribute("make a client with another URL")
         handle_local_echo = ForeignAttribute("set `echo=1` in the URL")
+        retries = ForeignAttribute("set `retries` in the URL")
+        auto_close = close_port_after_each_call = ForeignAttribute("set `close_after=1` in the URL")
+        byteorder = wordorder = ForeignAttribute("the order is an argument of `read` and `write`")
+        trace = max_in_flight = ForeignAttribute("it is an argument of the constructor")
 
     def __init__(self, url: str, unit: int, timeout: float) -> None:
-        self.target = parse(url)
+        self._target = parse(url)
         self.unit = unit
         self.timeout = timeout
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}('{self._target}', unit={self._unit})"
+
+    @property
+    def target(self) -> Target:
+        """The device, as its URL says."""
+        return self._target
 
     @property
     def unit(self) -> int:
@@ -77,7 +93,7 @@ class BaseClient:
     def unit_for(self, request: Request, unit: int | None) -> int:
         """The unit id of a call. Raises `ValueError` for a function that can't be broadcast."""
         unit = self._unit if unit is None else checked_unit(unit)
-        if is_broadcast(self.target, unit):
+        if is_broadcast(self._target, unit):
             code = request.pdu[0]
             if code not in BROADCAST_CODES:
                 raise ValueError(f"{BROADCAST}; function {code} can't be broadcast")

@@ -43,6 +43,8 @@ class Client(AsyncOperations):
     21.5
     """
 
+    __slots__ = ()
+
     def __init__(
         self,
         url: str,
@@ -56,7 +58,7 @@ class Client(AsyncOperations):
         most = as_integer(max_in_flight)
         if most is None or not 1 <= most <= MAX_IN_FLIGHT:
             raise ValueError(f"max_in_flight is {max_in_flight!r}, allowed: 1 to {MAX_IN_FLIGHT}")
-        self._transport = connection(self.target, most, trace)
+        self._transport = connection(self._target, most, trace)
 
     async def close(self) -> None:
         """Closes the connection: pending calls raise `ConnectionLost`, a later call reconnects."""

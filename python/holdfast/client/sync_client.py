@@ -41,6 +41,8 @@ class SyncClient(SyncOperations):
     [11, 22, 33]
     """
 
+    __slots__ = ()
+
     def __init__(
         self,
         url: str,
@@ -50,7 +52,7 @@ class SyncClient(SyncOperations):
         trace: Trace | None = None,
     ) -> None:
         super().__init__(url, unit, timeout)
-        self._transport = BlockingConnection(endpoint(self.target), trace)
+        self._transport = BlockingConnection(endpoint(self._target), trace)
 
     def close(self) -> None:
         """Closes the connection after the calls before it. A later call reconnects.

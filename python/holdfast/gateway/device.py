@@ -59,7 +59,7 @@ class _RequestClient(Client):
 
     def __init__(self, turns: Turns, unit: int, timeout: float) -> None:
         # It has no connection of its own, which the constructor of its base would create.
-        self.target, self.unit, self.timeout = turns.target, unit, timeout
+        self._target, self.unit, self.timeout = turns.target, unit, timeout
         self._transport = turns
 
 

@@ -83,6 +83,26 @@ class Poller:
     Raises `ValueError` or `TypeError` for a `gather` that is no time.
     """
 
+    __slots__ = (
+        "__weakref__",
+        "_changing",
+        "_connections",
+        "_core_names",
+        "_gather",
+        "_generations",
+        "_given_up",
+        "_has_ended",
+        "_names",
+        "_numbers",
+        "_places",
+        "_poller",
+        "_process",
+        "_queued",
+        "_readers",
+        "_results",
+        "_thread",
+    )
+
     def __init__(self, *, gather: float = 0.01) -> None:
         self._gather = checked_seconds("gather", gather, MAX_TIMEOUT_S, 0)
         self._poller = _core.Poller([])

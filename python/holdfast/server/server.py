@@ -17,6 +17,7 @@ from typing import (
 from urllib.parse import urlsplit
 
 from holdfast import _core
+from holdfast.client.base import ForeignAttribute
 from holdfast.client.serial_settings import SerialTarget
 from holdfast.client.tolerance import STRICT
 from holdfast.client.url import SERIAL_FORMS, SERIAL_SCHEMES, parse
@@ -82,6 +83,14 @@ class Server:
     >>> with holdfast.Server({1: memory}, bind="127.0.0.1:5020", access="read-write"):
     ...     input("Enter stops it. ")
     """
+
+    __slots__ = ("__weakref__", "_engine", "_identity", "_listener", "_starting", "_workers")
+
+    if not TYPE_CHECKING:  # Type checkers refuse these names as all that do not exist.
+        units = bind = access = sources = functions = deny = rules = identity = workers = tls = (
+            ForeignAttribute("it is an argument of the constructor")
+        )
+        host = port = ForeignAttribute("set `bind` in the constructor")
 
     def __init__(
         self,
