@@ -189,12 +189,15 @@ def test_a_value_is_written_between_two_reads(
         ("t", 19.55, ValueError),
         ("in", 1, ValueError),
         ("fixed", 1, ValueError),
-        ("x", 1, KeyError),
     ):
         with pytest.raises(error):
             poller.write("oven", tag, value)
-    with pytest.raises(KeyError):
+    with pytest.raises(KeyError, match="device oven has no tag 'x'"):
+        poller.write("oven", "x", 1)
+    with pytest.raises(KeyError, match="device 'x' is unknown, allowed: oven"):
         poller.write("x", "t", 1)
+    with pytest.raises(KeyError, match="device 'x' is unknown, allowed: oven"):
+        poller.remove("x")
     assert memory.read("holding_registers", 5, 1) == [195]
 
 

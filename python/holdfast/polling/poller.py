@@ -30,6 +30,7 @@ from holdfast.client.url import other_name, parse, shared_connection, shared_opt
 from holdfast.polling.faults import LOST, fault_text
 from holdfast.polling.readings import Batch, Reader
 from holdfast.protocol import READ_BITS, READ_REGISTERS
+from holdfast.runtime.text import listing
 from holdfast.tags import Tag, TagList
 from holdfast.tags.read_gap import DEFAULT_MAX_GAP
 
@@ -218,7 +219,8 @@ class Poller:
         """
         self._check_process()
         with self._changing:
-            core_name = self._core_names.pop(name)
+            core_name = self._core_name(name)
+            del self._core_names[name]
             del self._readers[core_name]
             place = self._places.pop(core_name)
             _, users = self._connections[place]
@@ -236,10 +238,10 @@ class Poller:
         a signal handler, as that of Ctrl-C, ends the wait: what was not sent yet is not sent.
         """
         self._check_process()
-        core_name = self._core_names[name]
+        core_name = self._core_name(name)
         of = self._readers[core_name].named.get(tag)
         if of is None:
-            raise KeyError(tag)
+            raise KeyError(f"device {name} has no tag {tag!r}")
         if not of.writable:
             raise ValueError(of.unwritable or f"{tag}: writable is not true in the tag list")
         raw = of.raw(value)
@@ -372,6 +374,13 @@ class Poller:
         """Stops polling. Batches that wait can still be taken."""
         if os.getpid() == self._process:
             self._poller.stop()
+
+    def _core_name(self, name: str) -> str:
+        """The name of a device in the core. Raises `KeyError`."""
+        core_name = self._core_names.get(name)
+        if core_name is None:
+            raise KeyError(f"device {name!r} is unknown, allowed: {listing(self._core_names)}")
+        return core_name
 
     def _check_process(self) -> None:
         """Raises `RuntimeError` in a forked child, which would wait for ever: also for a lock that
