@@ -7,11 +7,13 @@ import gc
 import sys
 import threading
 import weakref
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 import holdfast
+from holdfast.client import async_transports
 from support import transports, wire
 from support.fake_device import FakeDevice, Stream, registers
 from support.running import endpoint
@@ -262,3 +264,11 @@ def test_a_client_for_asyncio_that_shows_its_bytes_to_its_owner_ends_with_it(sch
 
     with Stream(scheme) as device:
         asyncio.run(main(device))
+
+
+def test_a_thread_of_calls_closes_its_connection_whichever_of_them_python_ends_first() -> None:
+    closed = threading.Event()
+    core: Any = SimpleNamespace(end_call=lambda: None, close=closed.set)
+    thread = async_transports._CallThread(core, None)
+    del thread
+    assert closed.wait(wire.DEADLINE)

@@ -202,6 +202,11 @@ class _CallThread(OwnThread):
     def _close(self) -> None:
         self._core.close()
 
+    def __del__(self) -> None:
+        # Python may finalize it before the connection, which could then submit nothing any more.
+        if self._thread is not None:
+            self.close()
+
 
 class AsyncConnection:
     """The connection of a client over TCP or TLS, in one event loop at a time."""
