@@ -52,10 +52,10 @@ USUAL_NAMES = {
     **dict.fromkeys(("be", "bebe", "big"), "ABCD"),
     **dict.fromkeys(("bele", "swap", "swapped", "wordswap", "wordswapped"), "CDAB"),
     **dict.fromkeys(("byteswap", "byteswapped", "lebe"), "BADC"),
-    **dict.fromkeys(("le", "lele", "little"), "DCBA"),
+    **dict.fromkeys(("le", "lele"), "DCBA"),
 }
 """What other programs call these orders, to suggest ours: letters only, without `endian`. Words
-that programs use for several, such as `mixed`, are not there."""
+that programs use for several, such as `mixed` and `little`, are not there."""
 DEFAULT_ORDER = "ABCD"
 """The order of a field for which nobody names one."""
 
