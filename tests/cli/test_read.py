@@ -421,7 +421,7 @@ def test_a_wrong_url_is_wrong_usage() -> None:
         (("4x0101.03",), "did you mean '4x0101:bit:3'?"),
         (("hr:100.15",), "did you mean 'hr:100:bit:15'?"),
         (("ir", "100.3"), "did you mean 'ir:100:bit:3'?"),
-        (("hr", "0", "--type", "float32", "--order", "little"), "did you mean 'DCBA'?"),
+        (("hr", "0", "--type", "float32", "--order", "le"), "did you mean 'DCBA'?"),
         (("4hr", "1"), "did you mean 'hr'?"),
         (("hr:5-2",), "in FIRST-LAST, the lower address is first: 2-5."),
     ],
