@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 from holdfast.config.checks.common import Scope, check_name, items, until_invalid
 from holdfast.config.models.base import InvalidValue
-from holdfast.config.values.home_assistant_classes import flaws as class_flaws
 from holdfast.protocol import READ_REGISTERS
 from holdfast.runtime.suggestion import suggestion
 from holdfast.runtime.text import extent
@@ -76,8 +75,7 @@ def _tags(scope: Scope, path: KeyPath, tags: Mapping[str, TagConfig], order: str
         with until_invalid():
             try:
                 found[name] = tag = settings.tag(name, order)
-                for key, flaw in class_flaws(tag):
-                    scope.report.warn((*where, key), flaw)
+                _warn_of_classes(scope, where, tag)
             except (TagError, InvalidValue):
                 for error in settings.flaws(name, order):
                     at = (*where, error.key)
@@ -85,6 +83,15 @@ def _tags(scope: Scope, path: KeyPath, tags: Mapping[str, TagConfig], order: str
                         at = (*path, "order") if path[0] == "profiles" else where
                     scope.report.add(at, str(error))
     return found
+
+
+def _warn_of_classes(scope: Scope, where: KeyPath, tag: Tag) -> None:
+    """Warns of classes with which Home Assistant would show no entity; most tags have none."""
+    if tag.device_class or tag.state_class:
+        from holdfast.config.values.home_assistant_classes import flaws
+
+        for key, flaw in flaws(tag):
+            scope.report.warn((*where, key), flaw)
 
 
 def _resolved(

@@ -14,7 +14,6 @@ from pydantic.json_schema import WithJsonSchema
 from holdfast.config.models.base import INVALID, InvalidValue, Model
 from holdfast.config.models.memories import Register
 from holdfast.config.text.messages import show
-from holdfast.config.values.home_assistant_classes import is_class_word
 from holdfast.config.values.scalars import NAME_KEYS, Name, NotNull, Number, check_state_name
 from holdfast.config.values.tag_scale import SCALE_SCHEMA, ScaleConfig, parse_scale, written_scale
 from holdfast.tags import Tag, TagError, TagList
@@ -55,6 +54,8 @@ def _one_line(value: str) -> str:
 
 
 def _class_word(value: str) -> str:
+    from holdfast.config.values.home_assistant_classes import is_class_word
+
     if value and not is_class_word(value):
         raise ValueError(f"found {show(value)}, allowed: a word, such as energy_storage")
     return value
