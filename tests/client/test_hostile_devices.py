@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 import os
-import shutil
 import signal
 import socket
 import struct
@@ -47,6 +46,7 @@ from support.fake_device import (
     good,
     silent,
 )
+from support.machine import missing, tool
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -650,12 +650,10 @@ for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has network namespaces")
 def test_a_client_whose_port_the_system_takes_from_the_device_does_not_answer_itself() -> None:
     """Nobody listens at the only port of a network that the system has for clients."""
-    command = ["unshare", "--map-root-user", "--net", sys.executable, "-c", ALONE]
-    if shutil.which(command[0]) is None:
-        pytest.skip("needs unshare")
+    command = [tool("unshare"), "--map-root-user", "--net", sys.executable, "-c", ALONE]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=wire.DEADLINE)
     if not ran.stdout:
-        pytest.skip(f"no network namespace: {ran.stderr}")
+        missing(f"the right to make a network namespace ({ran.stderr})")
     assert ran.stdout.split("\n") == ["alone", *["connection refused"] * 9, ""], ran.stderr
     assert ran.returncode == 0, ran.stderr
 

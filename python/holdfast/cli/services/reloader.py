@@ -56,6 +56,7 @@ class _Read:
 
 
 def _import_for(config: Config) -> None:
+    """Imports what an appliance without tags and adapters has not imported at its start."""
     if any(device.has_tags for device in config.devices.values()):
         import holdfast.appliance.parts.tag_values
         import holdfast.appliance.parts.tag_writes

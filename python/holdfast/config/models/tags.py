@@ -54,10 +54,12 @@ def _one_line(value: str) -> str:
 
 
 def _class_word(value: str) -> str:
-    from holdfast.config.values.home_assistant_classes import is_class_word
+    if value:
+        # Few configurations have one.
+        from holdfast.config.values.home_assistant_classes import is_class_word
 
-    if value and not is_class_word(value):
-        raise ValueError(f"found {show(value)}, allowed: a word, such as energy_storage")
+        if not is_class_word(value):
+            raise ValueError(f"found {show(value)}, allowed: a word, such as energy_storage")
     return value
 
 
